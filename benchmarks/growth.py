@@ -28,29 +28,21 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.postflight.short_flights import SEEN
+
 ROOT = Path(__file__).parents[1]
 SHIPPED = "irve2_reference"
 # some milliseconds a flight: four seconds of the entry, few factors, one atmosphere
-DISPERSIONS = """
+DISPERSIONS = f"""
 scenario = "short.toml"
 seed = 7
 chunk = 256
-
-[window]
-from_s = 402.0
-to_s = 406.0
-record_s = 0.02
-history_s = 0.1
-
-[outputs]
-scalars = ["peak_deflection_deg", "peak_normal_g", "deflection_deg_at_peak_pressure"]
-histories = ["alpha_total_deg", "deflection_deg"]
-
+{SEEN}
 [mass]
-offset_y_m = { normal = 0.001 }
+offset_y_m = {{ normal = 0.001 }}
 
 [joint]
-stiffness = { lognormal = 0.1 }
+stiffness = {{ lognormal = 0.1 }}
 
 [atmosphere]
 day = false

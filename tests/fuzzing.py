@@ -187,37 +187,47 @@ def _spoil_lines(lines: list[str], rng: np.random.Generator) -> list[str]:
     return [*lines[:one], lines[other], *lines[one:]]
 
 
-def spoil_table(data: bytes, rng: np.random.Generator) -> bytes:
-    """Spoil a CSV: a cell, a name, a line, some bytes."""
+Change = Callable[[list[str], float, np.random.Generator], None]
+
+
+def _spoil_text(data: bytes, rng: np.random.Generator, shares: tuple[float, float], change: Change) -> bytes:
+    """Spoil bytes or whole lines of a text, with these probabilities in sum, else a line as ``change`` does."""
     way = rng.random()
-    if way < 0.25:
+    if way < shares[0]:
         return spoil_bytes(data, rng)
     lines = data.decode().split("\n")[:-1]
-    if way < 0.45:
+    if way < shares[1]:
         lines = _spoil_lines(lines, rng)
     else:
-        row = 0 if way > 0.92 else int(rng.integers(len(lines)))
-        cells = lines[row].split(",")
-        k = int(rng.integers(len(cells)))
-        if row == 0:
-            names = (*cells, "x", "", cells[k].upper(), cells[k] + " ", cells[k].rsplit("_", 1)[0])
-            cells[k] = _pick(rng, tuple(names))
-        elif way < 0.75:
-            cells[k] = _pick(rng, CELLS)
-        else:
-            cells[k] = repr(float(rng.normal() * 10.0 ** rng.uniform(-12, 12)))
-        lines[row] = ",".join(cells)
+        change(lines, way, rng)
     return ("\n".join(lines) + "\n").encode("utf-8", "surrogatepass")
+
+
+def spoil_table(data: bytes, rng: np.random.Generator) -> bytes:
+    """Spoil a CSV: a cell, a name, a line, some bytes."""
+    return _spoil_text(data, rng, (0.25, 0.45), _spoil_cell)
+
+
+def _spoil_cell(lines: list[str], way: float, rng: np.random.Generator) -> None:
+    row = 0 if way > 0.92 else int(rng.integers(len(lines)))
+    cells = lines[row].split(",")
+    k = int(rng.integers(len(cells)))
+    if row == 0:
+        names = (*cells, "x", "", cells[k].upper(), cells[k] + " ", cells[k].rsplit("_", 1)[0])
+        cells[k] = _pick(rng, tuple(names))
+    elif way < 0.75:
+        cells[k] = _pick(rng, CELLS)
+    else:
+        cells[k] = repr(float(rng.normal() * 10.0 ** rng.uniform(-12, 12)))
+    lines[row] = ",".join(cells)
 
 
 def spoil_toml(data: bytes, rng: np.random.Generator) -> bytes:
     """Spoil a TOML file: a value, a key, a line, some bytes."""
-    way = rng.random()
-    if way < 0.15:
-        return spoil_bytes(data, rng)
-    lines = data.decode().split("\n")[:-1]
-    if way < 0.35:
-        return ("\n".join(_spoil_lines(lines, rng)) + "\n").encode()
+    return _spoil_text(data, rng, (0.15, 0.35), _spoil_entry)
+
+
+def _spoil_entry(lines: list[str], way: float, rng: np.random.Generator) -> None:
     at = [k for k, line in enumerate(lines) if "=" in line and not line.startswith("#")]
     k = at[int(rng.integers(len(at)))]
     key, _, value = lines[k].partition("=")
@@ -234,7 +244,6 @@ def spoil_toml(data: bytes, rng: np.random.Generator) -> bytes:
             new = _pick(rng, ("nan", "-inf", "1e308", "0", "-0.0", '"1"', "true", repr(float(rng.normal(0.0, 50.0)))))
             value = value[: n.start()] + new + value[n.end() :]
     lines[k] = f"{key.strip()} = {value.strip()}"
-    return ("\n".join(lines) + "\n").encode()
 
 
 # -------------------------------------------------------------------------------------- a plain reader, and the judges

@@ -64,30 +64,25 @@ MARK = {
 
 
 @dataclass(frozen=True)
-class StabilityMap:
-    """Growth over a grid of joints at one pressure and speed.
+class JointGrid:
+    """Joints of one vehicle at one pressure and speed: stiffness (k,), and damping (c,) of critical at each of it."""
 
-    Parameters
-    ----------
-    stiffness_nmprad : (k,) float
-    damping_ratio : (c,) float
-        Of critical (seed paper eq. [8]) at each stiffness.
-    growth_rate_radps : (k, c) float
-        Largest growth rate, 1/s.
-    zone : (k, c) int
-        `linear.STABLE`, `linear.UNSTABLE`, `linear.DIVERGENT`.
-    critical_stiffness_nmprad : float
-        Static limit of divergence.
-    """
-
+    vehicle: Vehicle
+    slopes: Slopes
+    pressure_pa: float
+    speed_mps: float
     stiffness_nmprad: FloatArray
-    damping_ratio: FloatArray
+    damping_ratio: FloatArray  # of critical: seed paper eq. [8]
+
+
+@dataclass(frozen=True)
+class StabilityMap:
+    """Largest growth rates (k, c), 1/s, and zones (k, c) over a grid of joints, and the static limit of divergence."""
+
+    grid: JointGrid
     growth_rate_radps: FloatArray
     zone: NDArray[np.int64]
     critical_stiffness_nmprad: float
-    pressure_pa: float
-    speed_mps: float
-    slopes: Slopes
 
 
 def on_axis(vehicle: Vehicle, slopes: Slopes) -> Vehicle:
@@ -125,39 +120,26 @@ def with_spring(vehicle: Vehicle, stiffness_nmprad: float, damping_ratio: float,
     return replace(made, joint=made.joint.model_copy(update={"bending_damping_nmsprad": damping}))
 
 
-def linear_map(
-    vehicle: Vehicle,
-    slopes: Slopes,
-    pressure_pa: float,
-    speed_mps: float,
-    stiffness_nmprad: FloatArray,
-    damping_ratio: FloatArray,
-) -> StabilityMap:
+def linear_map(grid: JointGrid) -> StabilityMap:
     """Map from the eigenvalues of the linear model."""
-    plain = on_axis(vehicle, slopes)
+    plain = on_axis(grid.vehicle, grid.slopes)
 
     def at(stiffness: float, damping: float) -> tuple[float, int]:
-        found = modes(linear_matrix(with_spring(plain, stiffness, damping), slopes, pressure_pa, speed_mps))
+        sprung = with_spring(plain, stiffness, damping)
+        found = modes(linear_matrix(sprung, grid.slopes, grid.pressure_pa, grid.speed_mps))
         return found.growth_rate_radps, found.zone
 
-    return _map(plain, slopes, pressure_pa, speed_mps, stiffness_nmprad, damping_ratio, at)
+    return _map(grid, plain, at)
 
 
-def flown_map(
-    vehicle: Vehicle,
-    slopes: Slopes,
-    pressure_pa: float,
-    speed_mps: float,
-    stiffness_nmprad: FloatArray,
-    damping_ratio: FloatArray,
-) -> StabilityMap:
+def flown_map(grid: JointGrid) -> StabilityMap:
     """Map from flights of the nonlinear simulator, released with the shell tilted by half a milliradian."""
-    plain = on_axis(vehicle, slopes)
+    plain = on_axis(grid.vehicle, grid.slopes)
     start = _release()
     gravity = float(np.linalg.norm(earth.gravitation(start[:3] - np.array([0.0, 0.0, 0.5 * START_M]))))
-    fall_pa = plain.mass_kg * gravity / (plain.reference.area_m2 * slopes.ca)
-    factor = fall_pa / pressure_pa
-    fall_mps = speed_mps * float(np.sqrt(factor))
+    fall_pa = plain.mass_kg * gravity / (plain.reference.area_m2 * grid.slopes.ca)
+    factor = fall_pa / grid.pressure_pa
+    fall_mps = grid.speed_mps * float(np.sqrt(factor))
     start[5] -= fall_mps
     air = simulate.atmosphere_table(_even_air(2.0 * fall_pa / fall_mps**2))
 
@@ -168,23 +150,14 @@ def flown_map(
         growth, zone = _growth(states)
         return growth / float(np.sqrt(factor)), zone
 
-    return _map(plain, slopes, pressure_pa, speed_mps, stiffness_nmprad, damping_ratio, at)
+    return _map(grid, plain, at)
 
 
-def _map(
-    vehicle: Vehicle,
-    slopes: Slopes,
-    pressure_pa: float,
-    speed_mps: float,
-    stiffness_nmprad: FloatArray,
-    damping_ratio: FloatArray,
-    at: Callable[[float, float], tuple[float, int]],
-) -> StabilityMap:
-    pairs = [[at(float(k), float(c)) for c in damping_ratio] for k in stiffness_nmprad]
+def _map(grid: JointGrid, plain: Vehicle, at: Callable[[float, float], tuple[float, int]]) -> StabilityMap:
+    pairs = [[at(float(k), float(c)) for c in grid.damping_ratio] for k in grid.stiffness_nmprad]
     growth = np.array([[pair[0] for pair in row] for row in pairs])
     zone = np.array([[pair[1] for pair in row] for row in pairs], dtype=np.int64)
-    limit = critical_stiffness_nmprad(vehicle, slopes, pressure_pa)
-    return StabilityMap(stiffness_nmprad, damping_ratio, growth, zone, limit, pressure_pa, speed_mps, slopes)
+    return StabilityMap(grid, growth, zone, critical_stiffness_nmprad(plain, grid.slopes, grid.pressure_pa))
 
 
 def _even_air(density_kgpm3: float) -> AtmosphereProfile:
@@ -231,14 +204,14 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
     """
     figure = Figure(figsize=(8.6, 5.6))
     axis = figure.subplots()
-    x, y = 1e-3 * linear.stiffness_nmprad, 100.0 * linear.damping_ratio
+    x, y = 1e-3 * linear.grid.stiffness_nmprad, 100.0 * linear.grid.damping_ratio
     axis.contourf(x, y, linear.zone.T, levels=[-0.5, 0.5, 1.5, 2.5], colors=[FILL[k] for k in sorted(FILL)])
     divergent = linear.zone == DIVERGENT
     for inside, levels in ((divergent, [2.0, 4.0]), (~divergent, [-0.05, 0.0, 0.05, 0.1])):
         growth = np.where(inside, linear.growth_rate_radps, np.nan).T
         lines = axis.contour(x, y, growth, levels=levels, colors=pf.plots.COLOUR["limit"], linewidths=0.8)
         axis.clabel(lines, fontsize=8, fmt="%g 1/s")
-    k, c = np.meshgrid(1e-3 * flown.stiffness_nmprad, 100.0 * flown.damping_ratio, indexing="ij")
+    k, c = np.meshgrid(1e-3 * flown.grid.stiffness_nmprad, 100.0 * flown.grid.damping_ratio, indexing="ij")
     handles: list[Patch | Line2D] = []
     for zone, (mark, colour) in MARK.items():
         inside = flown.zone == zone
@@ -251,8 +224,9 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
     label = "static limit q S C_A xbar (1 + xbar/L)"
     handles.append(Line2D([], [], color=pf.plots.COLOUR["limit"], linestyle="--", label=label))
     axis.set(xscale="log", yscale="log", xlabel="bending stiffness (kN m/rad)", ylabel="joint damping (% of critical)")
+    at = linear.grid
     axis.set_title(
-        f"q {linear.pressure_pa:.0f} Pa, V {linear.speed_mps:.0f} m/s, C_mq {linear.slopes.cmq:+.1f} constant",
+        f"q {at.pressure_pa:.0f} Pa, V {at.speed_mps:.0f} m/s, C_mq {at.slopes.cmq:+.1f} constant",
         fontsize=10,
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
@@ -265,8 +239,8 @@ def figure_axdahl_zones(linear: StabilityMap, flown: StabilityMap) -> Figure:
 def main(picture: Path) -> None:
     """Draw the map of the reference vehicle."""
     setting = (vehicle_from_toml(vehicle_path("irve2_reference")), SLOPES, PRESSURE_PA, SPEED_MPS)
-    fine = linear_map(*setting, np.geomspace(2.0e3, 5.0e4, 160), np.geomspace(1e-3, 0.4, 120))
-    flights = flown_map(*setting, np.geomspace(2.1e3, 4.7e4, 26), np.geomspace(1.2e-3, 0.34, 15))
+    fine = linear_map(JointGrid(*setting, np.geomspace(2.0e3, 5.0e4, 160), np.geomspace(1e-3, 0.4, 120)))
+    flights = flown_map(JointGrid(*setting, np.geomspace(2.1e3, 4.7e4, 26), np.geomspace(1.2e-3, 0.34, 15)))
     figure_axdahl_zones(fine, flights).savefig(picture, dpi=130)
 
 

@@ -16,20 +16,25 @@ from recon.smoother import Smoothed, full_step, measured_rows, store_moments
 from recon.state import unpacked
 
 
+def _before(observed, slots, innovations, row, mean, information):
+    """Mean and information before a measurement is used, and ``1 - K H``; as they are where it was not accepted."""
+    size = len(mean)
+    if not innovations.accepted[row]:
+        return mean, information, np.eye(size)
+    used, h = measured_rows(observed, slots, innovations, row, size)
+    weight = h.T @ np.linalg.inv(innovations.covariance[row][np.ix_(used, used)])
+    rest = np.eye(size) - innovations.gain[row][:, used] @ h
+    mean = rest.T @ mean - weight @ innovations.residual[row, used]
+    return mean, rest.T @ information @ rest + weight @ h, rest
+
+
 def bryson_frazier(steps, run, observed, slots, innovations, x, triangles, variance):
     """Smoothed errors ``x`` (n, N) in place, and moments at kept nodes, as `recon.smoother.rauch_tung_striebel`."""
     n, size = x.shape
     mean, information = np.zeros(size), np.zeros((size, size))
-    first, v = observed.first, innovations
     for k in reversed(range(n)):
-        for row in reversed(range(first[k], first[k + 1])):
-            if not v.accepted[row]:
-                continue
-            used, h = measured_rows(observed, slots, v, row, size)
-            weight = h.T @ np.linalg.inv(v.covariance[row][np.ix_(used, used)])
-            rest = np.eye(size) - v.gain[row][:, used] @ h
-            mean = rest.T @ mean - weight @ v.residual[row, used]
-            information = rest.T @ information @ rest + weight @ h
+        for row in reversed(range(observed.first[k], observed.first[k + 1])):
+            mean, information, _ = _before(observed, slots, innovations, row, mean, information)
         p = unpacked(run.p_minus[k])
         x[k] = run.x_minus[k] - p @ mean
         store_moments(run, k, p - p @ information @ p, triangles, variance)
@@ -45,13 +50,7 @@ def offset_scores(steps, observed, slots, innovations, columns, begin, end):
     score, variance = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
     for k in reversed(range(n)):
         for row in reversed(range(observed.first[k], observed.first[k + 1])):
-            if not innovations.accepted[row]:
-                continue
-            used, h = measured_rows(observed, slots, innovations, row, size)
-            weight = h.T @ np.linalg.inv(innovations.covariance[row][np.ix_(used, used)])
-            rest = np.eye(size) - innovations.gain[row][:, used] @ h
-            mean = rest.T @ mean - weight @ innovations.residual[row, used]
-            information = rest.T @ information @ rest + weight @ h
+            mean, information, rest = _before(observed, slots, innovations, row, mean, information)
             cross = rest.T @ cross
         if k == 0:
             break

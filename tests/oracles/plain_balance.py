@@ -145,15 +145,7 @@ def air(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> Air:
 
 
 def force_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
-    """Tilt of the force against the shell less the air's, ``atan(C_N/C_A)`` on the flow's side; shell y, z (n, 2), rad.
-
-    Parameters
-    ----------
-    vehicle : Vehicle
-        In place of the loads' own.
-    swing : Swing
-    loads : FlightLoads
-    """
+    """Readable twin of `estimators.balance.force_residual`."""
     force = _turned(axes(swing).transpose(0, 2, 1), specific_force(vehicle, swing, loads))
     of_air = air(vehicle, swing, loads)
     along = of_air.lateral + of_air.axial[:, None] * _X

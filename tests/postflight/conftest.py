@@ -21,6 +21,8 @@ from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from tests.in_process import runner
 from tests.recon import conftest as mini
 
+from .short_flights import content, fly, write_short
+
 START_S, END_S = 420.0, 430.0
 T0_UTC = "2009-08-17T12:52:00Z"
 
@@ -222,6 +224,20 @@ def mini_flight():
         return replace(mini.sense_everything(truth, seed, mini.SITES), sounding=air, vehicle=vehicle)
 
     return make
+
+
+@pytest.fixture(scope="module")
+def study_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short study's dispersions file, its scenario beside it."""
+    return write_short(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def reference(request: pytest.FixtureRequest, study_path: Path, tmp_path_factory) -> dict[str, bytes]:
+    """Bytes of the module's ``FLIGHTS`` of the short study, flown in this process, undisturbed."""
+    folder = tmp_path_factory.mktemp("reference") / "study"
+    fly(study_path, folder, request.module.FLIGHTS)
+    return content(folder)
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,14 @@ reference flight's pulse alone, with everything that a range delivers.
 import re
 
 from flightmodel.vehicle import DATA
+from postflight.montecarlo import execution
+from postflight.montecarlo.bands import merge, write_merged
+from postflight.montecarlo.execution import Wanted
+from postflight.montecarlo.study import read_study
 
-DISPERSIONS = """
-scenario = "short.toml"
-flights = 24
-seed = 7
-chunk = 4
+FLIGHTS = 24  # of the short study
 
+SEEN = """
 [window]
 from_s = 402.0
 to_s = 406.0
@@ -21,22 +22,28 @@ history_s = 0.1
 [outputs]
 scalars = ["peak_deflection_deg", "peak_normal_g", "deflection_deg_at_peak_pressure"]
 histories = ["alpha_total_deg", "deflection_deg"]
-
+"""
+DISPERSIONS = f"""
+scenario = "short.toml"
+flights = {FLIGHTS}
+seed = 7
+chunk = 4
+{SEEN}
 [initial]
-altitude_m = { normal = 300.0 }
-nose_elevation_deg = { uniform = [-2.0, 2.0] }
+altitude_m = {{ normal = 300.0 }}
+nose_elevation_deg = {{ uniform = [-2.0, 2.0] }}
 
 [mass]
-offset_y_m = { normal = 0.001 }
+offset_y_m = {{ normal = 0.001 }}
 
 [aerodynamics]
-cn = { normal = 0.07 }
+cn = {{ normal = 0.07 }}
 
 [joint]
-stiffness = { lognormal = 0.1 }
+stiffness = {{ lognormal = 0.1 }}
 
 [atmosphere]
-density = { normal = 0.02 }
+density = {{ normal = 0.02 }}
 """
 
 
@@ -77,3 +84,20 @@ def write_pulse(path):
         assert count, pattern
     path.write_text(text)
     return path
+
+
+def quiet(_fraction, _words):
+    pass
+
+
+def fly(path, folder, flights=FLIGHTS, **wanted):
+    """Fly a study into a folder and return it."""
+    study = read_study(str(path))
+    count = execution.run(study, folder, Wanted(flights, **wanted), quiet)
+    write_merged(folder, merge(study, folder, count))
+    return study
+
+
+def content(folder):
+    """Bytes of every file by name."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

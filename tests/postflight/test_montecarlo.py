@@ -33,44 +33,14 @@ from synthetic_flight import ensemble
 from tests.refusing import refuses
 
 from .killing import start_command
-from .short_flights import DISPERSIONS, ENTRY, write_short
+from .short_flights import DISPERSIONS, ENTRY, FLIGHTS, content, fly, quiet, write_short
 
-FLIGHTS = 24
 PARTIAL_GLOB = f".{PARTIAL}-*"
 
 
-def quiet(_fraction, _words):
-    pass
-
-
-def fly(path, folder, flights=FLIGHTS, **wanted):
-    study = read_study(str(path))
-    count = execution.run(study, folder, Wanted(flights, **wanted), quiet)
-    write_merged(folder, merge(study, folder, count))
-    return study
-
-
-def content(folder):
-    """Bytes of every file by name."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    return write_short(tmp_path_factory.mktemp("study"))
-
-
-@pytest.fixture(scope="module")
-def reference(path, tmp_path_factory):
-    """Bytes of the study flown in this process, undisturbed."""
-    folder = tmp_path_factory.mktemp("reference") / "study"
-    fly(path, folder)
-    return content(folder)
-
-
-def test_flights_are_all_there_and_differ(reference, path, tmp_path):
+def test_flights_are_all_there_and_differ(reference, study_path, tmp_path):
     assert sum(name.startswith("chunks/") for name in reference) == 6
-    fly(path, tmp_path / "study")
+    fly(study_path, tmp_path / "study")
     table = pd.read_csv(tmp_path / "study" / "flights.csv")
     assert table["run"].tolist() == list(range(FLIGHTS))
     assert table["peak_deflection_deg"].nunique() == FLIGHTS
@@ -85,14 +55,14 @@ def test_flights_are_all_there_and_differ(reference, path, tmp_path):
     np.testing.assert_allclose(one["p97.7"], np.percentile(every, 97.7, axis=0), rtol=1e-6)
 
 
-def test_two_processes_make_the_same_bytes(reference, path, tmp_path):
-    fly(path, tmp_path / "study", workers=2)
+def test_two_processes_make_the_same_bytes(reference, study_path, tmp_path):
+    fly(study_path, tmp_path / "study", workers=2)
     assert content(tmp_path / "study") == reference
 
 
-def test_bands_in_slabs_are_the_same(reference, path, tmp_path, monkeypatch):
+def test_bands_in_slabs_are_the_same(reference, study_path, tmp_path, monkeypatch):
     monkeypatch.setattr("postflight.montecarlo.bands.BAND_BYTES", 7 * 4 * FLIGHTS * 2)
-    fly(path, tmp_path / "study")
+    fly(study_path, tmp_path / "study")
     assert content(tmp_path / "study") == reference
 
 
@@ -114,13 +84,13 @@ def wait_for_chunks(process, folder, count):
 
 
 @pytest.mark.long
-def test_a_run_killed_twice_goes_on_to_the_same_bytes(path, tmp_path):
+def test_a_run_killed_twice_goes_on_to_the_same_bytes(study_path, tmp_path):
     """Killed without warning, once alone and once with two processes, whose workers follow their parent."""
     flights, folder = 96, tmp_path / "killed"
-    fly(path, tmp_path / "whole", flights=flights)
+    fly(study_path, tmp_path / "whole", flights=flights)
     total = chunks_in(tmp_path / "whole")
     for workers, count in (("1", 2), ("2", 8)):
-        process = command(path, folder, "--flights", str(flights), "--workers", workers)
+        process = command(study_path, folder, "--flights", str(flights), "--workers", workers)
         wait_for_chunks(process, folder, count)
         process.kill()
         process.wait()
@@ -128,7 +98,7 @@ def test_a_run_killed_twice_goes_on_to_the_same_bytes(path, tmp_path):
         wait_until_alone(process.pid)
     before = {p: p.stat().st_mtime_ns for p in (folder / "chunks").glob("chunk-*.npz")}
     left = chunks_in(folder)
-    fly(path, folder, flights=flights, workers=1)
+    fly(study_path, folder, flights=flights, workers=1)
     assert content(folder) == content(tmp_path / "whole")
     # nothing that was there has been flown again
     assert len(before) == left
@@ -148,9 +118,9 @@ def wait_until_alone(leader):
 
 
 @pytest.mark.slow
-def test_control_c_leaves_a_folder_that_goes_on(path, tmp_path):
+def test_control_c_leaves_a_folder_that_goes_on(study_path, tmp_path):
     flights, folder = 96, tmp_path / "stopped"
-    process = command(path, folder, "--flights", str(flights), "--workers", "2")
+    process = command(study_path, folder, "--flights", str(flights), "--workers", "2")
     wait_for_chunks(process, folder, 3)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
     printed = process.communicate(timeout=30)[1].decode()
@@ -161,24 +131,24 @@ def test_control_c_leaves_a_folder_that_goes_on(path, tmp_path):
     assert not list(folder.rglob(PARTIAL_GLOB))
     found = status(folder)
     assert 3 <= found.chunks < found.chunks_wanted
-    fly(path, folder, flights=flights)
+    fly(study_path, folder, flights=flights)
     assert status(folder).flights == flights
 
 
-def test_a_longer_study_keeps_what_was_flown(reference, path, tmp_path):
+def test_a_longer_study_keeps_what_was_flown(reference, study_path, tmp_path):
     folder = tmp_path / "study"
-    fly(path, folder, flights=10)  # the last chunk is not full
+    fly(study_path, folder, flights=10)  # the last chunk is not full
     early = chunk_path(folder, 0).stat().st_mtime_ns
-    fly(path, folder)
+    fly(study_path, folder)
     assert content(folder) == reference
     assert chunk_path(folder, 0).stat().st_mtime_ns == early
     with refuses("study-larger", names=[r"\b24\b"], kind=ConfigError):
-        fly(path, folder, flights=10)
+        fly(study_path, folder, flights=10)
 
 
-def test_damaged_and_abandoned_files_are_flown_again(reference, path, tmp_path):
+def test_damaged_and_abandoned_files_are_flown_again(reference, study_path, tmp_path):
     folder = tmp_path / "study"
-    fly(path, folder)
+    fly(study_path, folder)
     chunk_path(folder, 2).write_bytes(chunk_path(folder, 2).read_bytes()[:700])
     whole = bytearray(chunk_path(folder, 3).read_bytes())
     whole[400] ^= 255
@@ -188,16 +158,16 @@ def test_damaged_and_abandoned_files_are_flown_again(reference, path, tmp_path):
     ended.wait()
     (folder / "chunks" / f".{PARTIAL}-{machine()}-{ended.pid}-00000000-chunk-000001.npz").write_bytes(b"half")
     assert status(folder).chunks == 3
-    study = read_study(str(path))
+    study = read_study(str(study_path))
     with refuses("chunk-missing", names=[r"\b3\b.*\b6\b"]):
         merge(study, folder, FLIGHTS)
-    fly(path, folder)
+    fly(study_path, folder)
     assert content(folder) == reference
 
 
-def test_other_settings_are_refused_with_what_differs(path, tmp_path):
+def test_other_settings_are_refused_with_what_differs(study_path, tmp_path):
     folder = tmp_path / "study"
-    fly(path, folder, flights=4)
+    fly(study_path, folder, flights=4)
     other = tmp_path / "other"
     other.mkdir()
     changed = write_short(
@@ -215,7 +185,7 @@ def test_other_settings_are_refused_with_what_differs(path, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").write_text("mine")
     with pytest.raises(ConfigError) as refused:
-        fly(path, tmp_path / "full", flights=4)
+        fly(study_path, tmp_path / "full", flights=4)
     assert refused.value.codes == ("folder-not-empty",)
 
 
@@ -239,7 +209,7 @@ def test_wrong_files_are_refused(tmp_path, old, new, named, code):
     assert code is None or code in refused.value.codes
 
 
-def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_path, monkeypatch):
+def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, study_path, tmp_path, monkeypatch):
     folder, case = tmp_path / "study", ensemble.dispersed_case
     seen = iter(range(FLIGHTS))
 
@@ -251,7 +221,7 @@ def test_a_failed_flight_is_a_row_and_can_be_flown_again(reference, path, tmp_pa
         return case(*arguments)
 
     monkeypatch.setattr(ensemble, "dispersed_case", unlucky)
-    fly(path, folder)
+    fly(study_path, folder)
     found = status(folder)
     assert found.failed == {"out of luck": 2, "ZeroDivisionError: a defect": 1}
     table = pd.read_csv(folder / "flights.csv")
@@ -281,9 +251,9 @@ def test_a_study_of_failures_alone_is_an_error(tmp_path):
         ("peak_deflection=1", "output-unknown"),
     ],
 )
-def test_a_wrong_width_is_refused(path, tmp_path, text, code):
+def test_a_wrong_width_is_refused(study_path, tmp_path, text, code):
     with pytest.raises(ConfigError) as refused:
-        commands.run(str(path), tmp_path / "study", 6, 1, None, text)
+        commands.run(str(study_path), tmp_path / "study", 6, 1, None, text)
     assert refused.value.codes == (code,)
 
 
@@ -302,10 +272,10 @@ def test_intervals_cover_as_order_statistics_say():
     assert np.isnan(percentile_interval(np.arange(20.0), percentile, confidence)[1])
 
 
-def test_the_stop_rule_stops_at_the_same_flight_on_any_workers(path, tmp_path):
+def test_the_stop_rule_stops_at_the_same_flight_on_any_workers(study_path, tmp_path):
     stop = Stop(output="peak_deflection_deg", width=0.05, percentile=50.0)
-    one = fly(path, tmp_path / "one", flights=200, stop=stop)
-    fly(path, tmp_path / "two", flights=200, workers=2, stop=stop)
+    one = fly(study_path, tmp_path / "one", flights=200, stop=stop)
+    fly(study_path, tmp_path / "two", flights=200, workers=2, stop=stop)
     held = content(tmp_path / "one")
     assert held == content(tmp_path / "two")
     flights = status(tmp_path / "one").flights_wanted
@@ -318,9 +288,9 @@ def test_the_stop_rule_stops_at_the_same_flight_on_any_workers(path, tmp_path):
     assert execution.run(one, tmp_path / "one", Wanted(200, stop=stop), quiet) == flights
 
 
-def test_chunks_that_come_out_of_order_do_not_stop_it_earlier(path, tmp_path):
-    fly(path, tmp_path / "study")
-    study = read_study(str(path))
+def test_chunks_that_come_out_of_order_do_not_stop_it_earlier(study_path, tmp_path):
+    fly(study_path, tmp_path / "study")
+    study = read_study(str(study_path))
     chunks = [read_chunk(tmp_path / "study", k) for k in range(6)]
     stop = Stop(output="peak_deflection_deg", width=1e9, percentile=50.0)
     enough = execution._Enough(study, stop, FLIGHTS)
@@ -330,8 +300,8 @@ def test_chunks_that_come_out_of_order_do_not_stop_it_earlier(path, tmp_path):
     assert enough.reached in (8, 12, 16)
 
 
-def test_a_worker_that_is_killed_is_a_message(path, monkeypatch):
-    study = read_study(str(path))
+def test_a_worker_that_is_killed_is_a_message(study_path, monkeypatch):
+    study = read_study(str(study_path))
     jobs = [(k, study.runs_of(k, 400)) for k in range(100)]
     flown = execution.fly_jobs(study, jobs, 2, None)
     next(flown)

@@ -19,23 +19,10 @@ from postflight.montecarlo.study import read_study
 from tests.documents import ROOT
 from tests.refusing import printed_codes
 
-from .short_flights import write_short
-from .test_montecarlo import content, fly, quiet
+from .short_flights import content, fly, quiet
 
 distributed = pytest.importorskip("distributed", reason="Dask distributed is not installed: postflight[cluster]")
-FLIGHTS = 96
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    return write_short(tmp_path_factory.mktemp("study"))
-
-
-@pytest.fixture(scope="module")
-def reference(path, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("reference") / "study"
-    fly(path, folder, flights=FLIGHTS)
-    return content(folder)
+FLIGHTS = 96  # of the reference, too
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +32,14 @@ def cluster():
 
 
 @pytest.mark.slow
-def test_three_workers_make_the_same_bytes(reference, path, cluster, tmp_path):
-    fly(path, tmp_path / "study", flights=FLIGHTS, scheduler=cluster.scheduler_address)
+def test_three_workers_make_the_same_bytes(reference, study_path, cluster, tmp_path):
+    fly(study_path, tmp_path / "study", flights=FLIGHTS, scheduler=cluster.scheduler_address)
     assert content(tmp_path / "study") == reference
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_its_chunk_only(reference, path, cluster, tmp_path, monkeypatch):
-    study, folder, come = read_study(str(path)), tmp_path / "study", []
+def test_a_killed_worker_costs_its_chunk_only(reference, study_path, cluster, tmp_path, monkeypatch):
+    study, folder, come = read_study(str(study_path)), tmp_path / "study", []
     fly_jobs = execution.fly_jobs
 
     def killing(*arguments):
@@ -71,18 +58,18 @@ def test_a_killed_worker_costs_its_chunk_only(reference, path, cluster, tmp_path
     assert sorted(come) == list(range(study.chunks(FLIGHTS)))
 
 
-def test_a_scheduler_that_is_not_there_is_a_message(path, tmp_path, monkeypatch):
+def test_a_scheduler_that_is_not_there_is_a_message(study_path, tmp_path, monkeypatch):
     monkeypatch.setattr(execution, "CONNECT_S", 0.3)
     with pytest.raises(ConfigError) as refusal:
-        fly(path, tmp_path / "study", flights=8, scheduler="tcp://127.0.0.1:9")
+        fly(study_path, tmp_path / "study", flights=8, scheduler="tcp://127.0.0.1:9")
     assert refusal.value.codes == ("scheduler-unreachable",)
 
 
-def test_a_chunk_can_travel(path):
+def test_a_chunk_can_travel(study_path):
     """What is sent to workers and back survives its pickling."""
     import pickle
 
-    study = pickle.loads(pickle.dumps(read_study(str(path))))
+    study = pickle.loads(pickle.dumps(read_study(str(study_path))))
     _, chunk = pickle.loads(pickle.dumps(execution.fly_chunk(study, (0, [0, 1]))))
     again = chunk_from_rows(execution.fly_runs(study.plan, [0, 1], study.draws_of), study.plan.scalars)
     assert chunk.scalars.tobytes() == again.scalars.tobytes()
@@ -153,16 +140,16 @@ def test_an_open_scheduler_is_known(address, is_open):
     assert execution.is_open(address) == is_open
 
 
-def test_an_open_scheduler_is_named(path, tmp_path, monkeypatch, command):
+def test_an_open_scheduler_is_named(study_path, tmp_path, monkeypatch, command):
     monkeypatch.setattr(execution, "CONNECT_S", 0.3)
     for address, codes in (("tcp://0.0.0.0:9", ["scheduler-open"]), ("tcp://127.0.0.1:9", [])):
-        done = command("montecarlo", "run", path, tmp_path / "study", "--flights", "8", "--scheduler", address)
+        done = command("montecarlo", "run", study_path, tmp_path / "study", "--flights", "8", "--scheduler", address)
         assert printed_codes(done.stdout) == codes
         assert printed_codes(done.stderr) == ["scheduler-unreachable"]
 
 
 @pytest.mark.long
-def test_a_cluster_with_tls_makes_the_same_bytes(reference, path, tmp_path, monkeypatch):
+def test_a_cluster_with_tls_makes_the_same_bytes(reference, study_path, tmp_path, monkeypatch):
     """With certificates from the environment's settings, as the page has it; one without is not let in."""
     dask = pytest.importorskip("dask")
     if shutil.which("openssl") is None:
@@ -178,9 +165,9 @@ def test_a_cluster_with_tls_makes_the_same_bytes(reference, path, tmp_path, monk
     with dask.config.set(tls):
         options = {"threads_per_worker": 1, "processes": True, "dashboard_address": None, "protocol": "tls://"}
         with distributed.LocalCluster(n_workers=2, security=distributed.Security(), **options) as found:
-            fly(path, tmp_path / "study", flights=FLIGHTS, scheduler=found.scheduler_address)
+            fly(study_path, tmp_path / "study", flights=FLIGHTS, scheduler=found.scheduler_address)
             assert found.scheduler_address.startswith("tls://")
             with dask.config.set(bare), pytest.raises(ConfigError) as refusal:
-                fly(path, tmp_path / "other", flights=8, scheduler=found.scheduler_address)
+                fly(study_path, tmp_path / "other", flights=8, scheduler=found.scheduler_address)
     assert refusal.value.codes == ("scheduler-unreachable",)
     assert content(tmp_path / "study") == reference

@@ -57,6 +57,19 @@ def gauss_markov(t, count, sd, time_constant_s, rng):
     return out
 
 
+def squared_errors(trajectory, states, at_s):
+    """Squared normalised errors, of six components, of position and velocity at some times of a flight."""
+    out = []
+    for moment in at_s:
+        k, j = int(np.argmin(np.abs(trajectory.time_s - moment))), round(moment / 0.05)
+        d = np.r_[
+            trajectory.position_ecef_m[k] - states[j].position_ecef_m,
+            trajectory.velocity_ecef_mps[k] - states[j].velocity_ecef_mps,
+        ]
+        out.append(d @ np.linalg.solve(trajectory.covariance[k, :6, :6], d))
+    return out
+
+
 @cache
 def fly(seed, end_s=80.0, spec=SPEC, height_m=90e3, velocity_ned_mps=(300.0, 900.0, 400.0)):
     """Times and states of one flight drawn from the model: drivers that wander, white acceleration noise."""

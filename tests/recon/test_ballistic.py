@@ -15,7 +15,17 @@ from recon.settings import Settings
 from recon.state import States, boxminus, boxplus
 from tests.oracles import ballistic as plain_ballistic
 
-from .ballistic_flight import LATITUDE, LONGITUDE, SPEC, across_plane, entry_state, fly, watch, windy_sounding
+from .ballistic_flight import (
+    LATITUDE,
+    LONGITUDE,
+    SPEC,
+    across_plane,
+    entry_state,
+    fly,
+    squared_errors,
+    watch,
+    windy_sounding,
+)
 
 ACROSS = across_plane(entry_state())
 DRIVERS = np.array([0.1, 0.05, -0.08, 0.7, -1.1, 0.6])
@@ -241,19 +251,6 @@ def test_powered_spans_open_the_noise():
     assert np.allclose(motion.force_density[~powered], SPEC.acceleration_density**2)
 
 
-def six(trajectory, t, states, at):
-    """Squared normalised errors of position and velocity at chosen times."""
-    out = []
-    for moment in at:
-        k, j = int(np.argmin(np.abs(trajectory.time_s - moment))), round(moment / 0.05)
-        d = np.r_[
-            trajectory.position_ecef_m[k] - states[j].position_ecef_m,
-            trajectory.velocity_ecef_mps[k] - states[j].velocity_ecef_mps,
-        ]
-        out.append(d @ np.linalg.solve(trajectory.covariance[k, :6, :6], d))
-    return out
-
-
 @pytest.mark.parametrize(("gap", "runs"), [(None, 6), ((30.0, 55.0), 6)])
 def test_falls_err_as_they_claim(gap, runs):
     """Falls drawn from the model itself, radars with biases, with and without a gap in which only drag carries on."""
@@ -264,7 +261,7 @@ def test_falls_err_as_they_claim(gap, runs):
         r = reconstruct(watch(t, states, seed, gap_s=gap), Settings(output_rate_hz=2.0))
         assert r.provenance["motion"] == "ballistic"
         assert np.allclose(np.diagonal(r.smoothed.covariance, axis1=1, axis2=2)[:, 6:9], np.pi**2 / 3.0)
-        values.append([six(r.smoothed, t, states, at), six(r.filtered, t, states, at)])
+        values.append([squared_errors(r.smoothed, states, at), squared_errors(r.filtered, states, at)])
         table = r.sensor_errors.set_index("name")
         assert (table.sd[:6] < 1.001 * table.prior_sd[:6]).all()
     low, high = chi2.ppf([5e-5, 1.0 - 5e-5], 6 * runs) / runs
@@ -298,7 +295,7 @@ def test_reentry_of_the_known_benchmark_errs_as_it_claims():
         t, states = fly(seed, 100.0, spec, 125e3, (-800.0, 6500.0, 2200.0))
         telemetry = replace(watch(t, states, seed), motion=spec)
         r = reconstruct(telemetry, Settings(output_rate_hz=1.0))
-        values.append([six(r.smoothed, t, states, at), six(r.filtered, t, states, at)])
+        values.append([squared_errors(r.smoothed, states, at), squared_errors(r.filtered, states, at)])
     low, high = chi2.ppf([5e-5, 1.0 - 5e-5], 6 * runs) / runs
     mean = np.mean(values, axis=0)
     assert (mean > low).all(), mean

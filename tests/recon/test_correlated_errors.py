@@ -16,9 +16,10 @@ from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.setup import build_problem, track_points
 
-from .ballistic_flight import SITES, SPEC, fly, watch
+from .ballistic_flight import SITES, SPEC, fly, squared_errors, watch
 
 SITE = {"file": "r.csv", "latitude_deg": 10.0, "longitude_deg": 20.0, "height_m": 30.0}
+LOOKED_AT_S = (10.0, 25.0, 45.0, 65.0)
 ANGLES = (ThinnedSpan(every_s=1.0, components=("az", "el")),)
 # range and angles that err for seconds more than they scatter, read five times a second
 SLOW = [
@@ -113,30 +114,19 @@ def test_rows_of_their_own_give_the_same_trajectory():
     assert np.allclose(two.sd()[:, :3], sd, rtol=1e-4)
 
 
-def six(trajectory, t, states):
-    """Squared normalised errors of position and velocity at some times."""
-    out = []
-    for moment in (10.0, 25.0, 45.0, 65.0):
-        k, j = int(np.argmin(np.abs(trajectory.time_s - moment))), round(moment / 0.05)
-        off = np.r_[
-            trajectory.position_ecef_m[k] - states[j].position_ecef_m,
-            trajectory.velocity_ecef_mps[k] - states[j].velocity_ecef_mps,
-        ]
-        out.append(off @ np.linalg.solve(trajectory.covariance[k, :6, :6], off))
-    return out
-
-
 def test_correlated_errors_of_range_and_angles_are_as_large_as_stated():
     """All rows used, slow errors as states: the errors meet the covariance; taken for white noise they do not."""
     runs, modelled, white = 8, [], []
     for seed in range(runs):
         t, states = fly(seed, end_s=70.0)
         telemetry = watch(t, states, seed, SLOW)
-        modelled.append(six(reconstruct(telemetry, Settings(output_rate_hz=2.0)).smoothed, t, states))
+        modelled.append(
+            squared_errors(reconstruct(telemetry, Settings(output_rate_hz=2.0)).smoothed, states, LOOKED_AT_S)
+        )
         if seed < 3:
             as_white = {name: without_wander(r) for name, r in telemetry.radars.items()}
             as_white = reconstruct(replace(telemetry, radars=as_white), Settings(output_rate_hz=2.0))
-            white.append(six(as_white.smoothed, t, states))
+            white.append(squared_errors(as_white.smoothed, states, LOOKED_AT_S))
     low, high = chi2.ppf([5e-5, 1.0 - 5e-5], 6 * runs) / runs
     mean = np.mean(modelled, axis=0)
     assert (mean > low).all(), mean

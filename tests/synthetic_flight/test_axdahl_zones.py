@@ -10,6 +10,7 @@ import pytest
 
 from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE
 from tests.oracles import axdahl_zones
+from tests.oracles.axdahl_zones import JointGrid
 
 from .test_linear import PRESSURE_PA, SPEED_MPS, r1_slopes
 
@@ -17,9 +18,13 @@ STIFFNESS = np.geomspace(2.2e3, 4.0e4, 14)
 DAMPING = np.geomspace(2e-3, 0.3, 9)
 
 
+def grid_of(vehicle, cmq, damping=DAMPING):
+    return JointGrid(vehicle, r1_slopes(cmq), PRESSURE_PA, SPEED_MPS, STIFFNESS, damping)
+
+
 def test_zones_lie_as_axdahl_has_them(vehicle):
     # the static limit hardly moves with damping; stable at moderate stiffness; unstable again when stiff
-    found = axdahl_zones.linear_map(vehicle, r1_slopes(0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING)
+    found = axdahl_zones.linear_map(grid_of(vehicle, 0.2))
     soft = found.zone == DIVERGENT
     below = found.critical_stiffness_nmprad > STIFFNESS
     assert (soft == below[:, None]).all()
@@ -27,16 +32,14 @@ def test_zones_lie_as_axdahl_has_them(vehicle):
     assert (found.zone[moderate][:, DAMPING > 0.1] == STABLE).all()
     assert (found.zone[STIFFNESS > 2.0e4][:, DAMPING < 0.15] == UNSTABLE).all()
     # without propelling pitch damping nothing but divergence is left once the joint is damped by 5 %
-    damped = axdahl_zones.linear_map(
-        vehicle, r1_slopes(-0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING[DAMPING > 0.05]
-    )
+    damped = axdahl_zones.linear_map(grid_of(vehicle, -0.2, DAMPING[DAMPING > 0.05]))
     assert (damped.zone[~below] == STABLE).all()
 
 
 @pytest.mark.slow
 def test_flown_zones_agree_with_the_linear_model(vehicle, measured):
-    setting = (vehicle, r1_slopes(0.2), PRESSURE_PA, SPEED_MPS, STIFFNESS, DAMPING)
-    linear, flown = axdahl_zones.linear_map(*setting), axdahl_zones.flown_map(*setting)
+    grid = grid_of(vehicle, 0.2)
+    linear, flown = axdahl_zones.linear_map(grid), axdahl_zones.flown_map(grid)
     # a fall of 120 s is 340 s at this pressure: growth below 0.01 1/s is hidden by the other modes' beat
     clear = np.abs(linear.growth_rate_radps) > 0.01
     measured("share of the grid within 0.01 1/s of a boundary", 1.0 - clear.mean(), 0.10)
