@@ -51,7 +51,7 @@ def scenario_of(case, seed, servo):
 
 def restated(telemetry, **sizes):
     """The same readings with other sizes of slow errors in the flight file."""
-    radars = {n: replace(r, site=replace(r.site, **sizes)) for n, r in telemetry.radars.items()}
+    radars = {n: replace(r, spec=replace(r.spec, **sizes)) for n, r in telemetry.radars.items()}
     gnss = {n: replace(r, spec=replace(r.spec, **sizes)) for n, r in telemetry.gnss.items()}
     return replace(telemetry, radars=radars, gnss=gnss)
 

@@ -682,13 +682,13 @@ def _first_place(
     """Latitude and longitude, rad, of a stated start, the first receiver's first fix or first radar's first point."""
     points: list[FloatArray] = [] if state is None else [state.position_ecef_m[None]]
     points += [r.position_ecef_m for r in gnss.values()]
-    points += [ecef_from_radar(r.range_az_el, *r.site.geodetic, planet) for r in radars.values()]
+    points += [ecef_from_radar(r.range_az_el, *r.spec.geodetic, planet) for r in radars.values()]
     for point in points:
         whole = point[np.isfinite(point).all(axis=1)]
         if len(whole):
             latitude, longitude, _ = geodetic_from_ecef(whole[0], planet)
             return float(latitude), float(longitude)
-    site = next((radar.site for radar in radars.values()), None)
+    site = next((radar.spec for radar in radars.values()), None)
     return None if site is None else (site.latitude_rad, site.longitude_rad)  # angles or ranges alone: nearby
 
 

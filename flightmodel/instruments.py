@@ -219,13 +219,18 @@ def table_of(record: type) -> InstrumentTable:
 
 
 @dataclass(frozen=True)
-class TriadSpec:
+class InstrumentSpec:
+    """What an instrument's table in flight.toml states: its ``name`` there, its place, and its errors, one row each."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class TriadSpec(InstrumentSpec):
     """Three orthogonal sensors (accelerometers, rate gyros or magnetometers) on the centerbody.
 
     Parameters
     ----------
-    name : str
-        As in the flight file.
     position_from_datum_body_m : (3,) float
         Where the triad sits, body axes, m.
     dcm_body_sensor : (3, 3) float
@@ -244,7 +249,6 @@ class TriadSpec:
         time constant; 0 for none.
     """
 
-    name: str
     position_from_datum_body_m: FloatArray
     dcm_body_sensor: FloatArray
     noise_sd: float = error_row("", 0.0, Sd, simulated=None, required=True)
@@ -297,13 +301,11 @@ MAGNETOMETER = _triad_table(
 
 
 @dataclass(frozen=True)
-class RadarSite:
+class RadarSite(InstrumentSpec):
     """A tracking radar: slant range, azimuth from true north, elevation, refraction removed.
 
     Parameters
     ----------
-    name : str
-        As in the flight file.
     latitude_rad, longitude_rad, height_m : float
         WGS-84.
     angle_servo_hz : float
@@ -312,7 +314,6 @@ class RadarSite:
     All others are standard deviations, one row each.
     """
 
-    name: str
     latitude_rad: float
     longitude_rad: float
     height_m: float
@@ -427,13 +428,11 @@ class SitesSpec:
 
 
 @dataclass(frozen=True)
-class GnssSpec:
+class GnssSpec(InstrumentSpec):
     """A satellite navigation receiver and its antenna.
 
     Parameters
     ----------
-    name : str
-        As in the flight file.
     antenna_from_datum_body_m : (3,) float
         Where the antenna sits, body axes, m.
     horizontal_sd_m, vertical_sd_m : float
@@ -450,7 +449,6 @@ class GnssSpec:
         neighbouring velocities repeat their errors; 0 for none.
     """
 
-    name: str
     antenna_from_datum_body_m: FloatArray
     horizontal_sd_m: float = error_row("m", 5.0, Sd, simulated=("horizontal_sd_m",), required=True)
     vertical_sd_m: float = error_row("m", 10.0, Sd, simulated=("vertical_sd_m",), required=True)
@@ -471,13 +469,11 @@ class GnssSpec:
 
 
 @dataclass(frozen=True)
-class BarometerSpec:
+class BarometerSpec(InstrumentSpec):
     """A static pressure sensor read as a height.
 
     Parameters
     ----------
-    name : str
-        As in the flight file.
     sd_m : float
         White noise of a height.
     bias_sd_m : float
@@ -491,7 +487,6 @@ class BarometerSpec:
         Time tag minus true time, with the lag of a vented bay.
     """
 
-    name: str
     sd_m: float = error_row("m", 3.0, Sd)
     bias_sd_m: float = error_row("m", 60.0, states=("bias",))
     scale_sd: float = error_row("1", 0.03, Fraction, states=("scale",))
@@ -503,13 +498,11 @@ class BarometerSpec:
 
 
 @dataclass(frozen=True)
-class SunHeads:
+class SunHeads(InstrumentSpec):
     """Two-axis Sun sensors on the centerbody, each looking outward at its clocking angle.
 
     Parameters
     ----------
-    name : str
-        As in the flight file.
     clock_lv_rad : (k,) float
         Clocking angle of each head.
     field_rad : float
@@ -518,7 +511,6 @@ class SunHeads:
         White noise per sample and constant error normal to the line of sight, mounting rotation per axis of each head.
     """
 
-    name: str
     clock_lv_rad: FloatArray
     field_rad: float
     noise_sd_rad: float = error_row("rad", 1.0, Sd, simulated=None, required=True, step="resolution_deg")

@@ -12,7 +12,7 @@ import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
 from flightmodel.earth import WGS84, Planet
-from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
+from flightmodel.instruments import BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
 from flightmodel.thinning import ThinnedSpan
 from flightmodel.vehicle import Vehicle
 
@@ -21,61 +21,77 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class TriadRecord:
+class SensorRecord:
+    """Readings of one instrument, as its file has them after the gate; what derives from it names them.
+
+    Parameters
+    ----------
+    spec : InstrumentSpec
+    time_s : (n,) float
+        Strictly increasing, seconds after t0.
+    """
+
+    spec: InstrumentSpec
+    time_s: FloatArray
+
+    def __post_init__(self) -> None:
+        """Check once."""
+        check_increasing(self.spec.name, self.time_s)
+        for name, shape in self.shapes.items():
+            check_shape(self.spec.name, getattr(self, name), (len(self.time_s), *shape))
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class TriadRecord(SensorRecord):
     """Samples of three orthogonal sensors in their own axes.
 
     Parameters
     ----------
-    spec : TriadSpec
-    time_s : (n,) float
-        Strictly increasing, seconds after t0.
     measured_sensor : (n, 3) float
         Specific force m/s^2, rate of the body against inertial space rad/s, or magnetic field T, in sensor axes; NaN
         is missing.
     """
 
     spec: TriadSpec
-    time_s: FloatArray
     measured_sensor: FloatArray
 
-    def __post_init__(self) -> None:
-        """Check once."""
-        check_increasing(self.spec.name, self.time_s)
-        check_shape(self.spec.name, self.measured_sensor, (len(self.time_s), 3))
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        return {"measured_sensor": (3,)}
 
 
 @dataclass(frozen=True)
-class SunRecord:
+class SunRecord(SensorRecord):
     """What Sun heads saw.
 
     Parameters
     ----------
-    spec : SunHeads
-    time_s : (n,) float
-        Strictly increasing, seconds after t0.
     az_el_head_rad : (n, k, 2) float
         Azimuth and elevation of the Sun in each head's axes (`flightmodel.instruments.sun_angles_from_direction`); NaN
         where a head sees no Sun.
     """
 
     spec: SunHeads
-    time_s: FloatArray
     az_el_head_rad: FloatArray
 
-    def __post_init__(self) -> None:
-        """Check once."""
-        check_increasing(self.spec.name, self.time_s)
-        check_shape(self.spec.name, self.az_el_head_rad, (len(self.time_s), len(self.spec.clock_lv_rad), 2))
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        return {"az_el_head_rad": (len(self.spec.clock_lv_rad), 2)}
 
 
 @dataclass(frozen=True)
-class RadarRecord:
+class RadarRecord(SensorRecord):
     """Readings of one radar, telescope or Doppler station; NaN is missing.
 
     Parameters
     ----------
-    site : RadarSite
-    time_s : (n,) float
     range_az_el : (n, 3) float
         Slant range m, azimuth from true north and elevation rad; columns that it does not measure are NaN.
     point : str
@@ -87,29 +103,25 @@ class RadarRecord:
         Noise of each range, azimuth, elevation, range rate; NaN, or None, where the site's holds.
     """
 
-    site: RadarSite
-    time_s: FloatArray
+    spec: RadarSite
     range_az_el: FloatArray
     point: str = "cg"
     every_s: tuple[ThinnedSpan, ...] = ()
     range_rate_mps: FloatArray | None = None
     sd: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        """Check once."""
-        check_increasing(self.site.name, self.time_s)
-        check_shape(self.site.name, self.range_az_el, (len(self.time_s), 3))
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        return {"range_az_el": (3,)}
 
 
 @dataclass(frozen=True)
-class GnssRecord:
+class GnssRecord(SensorRecord):
     """Fixes of one satellite navigation receiver, of its antenna.
 
     Parameters
     ----------
-    spec : GnssSpec
-    time_s : (n,) float
-        Strictly increasing, seconds after t0.
     position_ecef_m : (n, 3) float
         NaN is missing; of a receiver that gives velocities alone, all are.
     velocity_ecef_mps : (n, 3) float
@@ -122,17 +134,15 @@ class GnssRecord:
     """
 
     spec: GnssSpec
-    time_s: FloatArray
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
     every_s: tuple[ThinnedSpan, ...] = ()
     sd: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        """Check once."""
-        check_increasing(self.spec.name, self.time_s)
-        check_shape(self.spec.name, self.position_ecef_m, (len(self.time_s), 3))
-        check_shape(self.spec.name, self.velocity_ecef_mps, (len(self.time_s), 3))
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        return {"position_ecef_m": (3,), "velocity_ecef_mps": (3,)}
 
     @property
     def has_positions(self) -> bool:
@@ -141,14 +151,11 @@ class GnssRecord:
 
 
 @dataclass(frozen=True)
-class BarometerRecord:
+class BarometerRecord(SensorRecord):
     """Heights by static pressure.
 
     Parameters
     ----------
-    spec : BarometerSpec
-    time_s : (n,) float
-        Strictly increasing, seconds after t0.
     height_m : (n,) float
         Above the WGS-84 ellipsoid; NaN is missing.
     every_s : tuple of ThinnedSpan
@@ -156,14 +163,13 @@ class BarometerRecord:
     """
 
     spec: BarometerSpec
-    time_s: FloatArray
     height_m: FloatArray
     every_s: tuple[ThinnedSpan, ...] = ()
 
-    def __post_init__(self) -> None:
-        """Check once."""
-        check_increasing(self.spec.name, self.time_s)
-        check_shape(self.spec.name, self.height_m, (len(self.time_s),))
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of what is read at one time, by field."""
+        return {"height_m": ()}
 
 
 @dataclass(frozen=True)

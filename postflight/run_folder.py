@@ -463,7 +463,7 @@ def _sensors(flight: Reconstruction) -> list[dict[str, Any]]:
     has = flight.telemetry
     onboard = [r for r in (has.accelerometer, has.rates, has.magnetometer, has.sun) if r is not None]
     out = [{"samples": len(r.time_s), **_plain(asdict(r.spec))} for r in onboard]
-    out += [{"samples": len(r.time_s), "tracks": r.point, **_plain(asdict(r.site))} for r in has.radars.values()]
+    out += [{"samples": len(r.time_s), "tracks": r.point, **_plain(asdict(r.spec))} for r in has.radars.values()]
     return out + [
         {"samples": len(r.time_s), **_plain(asdict(r.spec))}
         for records in (has.gnss, has.barometers)

@@ -208,7 +208,7 @@ def radar_instrument(
     name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True, planet: Planet = WGS84
 ) -> Instrument:
     """One radar; a missing component leaves the others."""
-    site = record.site
+    site = record.spec
     sd = _noise(record, [site.range_sd_m, *site.angles_sd_rad], slice(0, 3))
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
@@ -227,7 +227,7 @@ def range_rate_instrument(
     name: str, record: RadarRecord, arm_body_m: FloatArray, planet: Planet = WGS84
 ) -> Instrument | None:
     """Range rates of one radar or Doppler station; None where it gives none."""
-    site = record.site
+    site = record.spec
     if record.range_rate_mps is None:
         return None
     value = np.column_stack([record.range_rate_mps, np.full((len(record.time_s), 2), np.nan)])

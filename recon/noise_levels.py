@@ -36,7 +36,7 @@ from scipy.special import ndtri
 
 from flightmodel import tables
 from flightmodel.checks import FloatArray, GateError, Progress
-from flightmodel.instruments import ACCELEROMETER, RATES, BarometerSpec, GnssSpec, RadarSite, TriadSpec, table_of
+from flightmodel.instruments import ACCELEROMETER, RATES, BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, table_of
 from flightmodel.telemetry import Telemetry
 from recon import ekf, reconstruct, single_faults
 from recon.reconstruct import Linearised
@@ -123,8 +123,7 @@ class _Place:
         changed = replace(self._spec(telemetry), **{self.field: value})
         if self.kind == "motion":
             return replace(telemetry, motion=changed)
-        record: Any = self._record(telemetry)
-        record = replace(record, **{"site" if self.kind == "radars" else "spec": changed})
+        record = replace(self._record(telemetry), spec=changed)
         whole: Any = {**getattr(telemetry, self.kind), self.name: record} if self.name else record
         parts: dict[str, Any] = {self.kind: whole}
         return replace(telemetry, **parts)
@@ -135,7 +134,7 @@ class _Place:
 
     def _spec(self, telemetry: Telemetry) -> Any:
         record = self._record(telemetry)
-        return record if self.kind == "motion" else getattr(record, "site" if self.kind == "radars" else "spec")
+        return record if self.kind == "motion" else record.spec
 
 
 def noise_levels(
@@ -212,7 +211,7 @@ def _places(telemetry: Telemetry, settings: Settings) -> list[_Place]:
 
 def _of_record(kind: str, name: str, record: Any, table: Any, section: str, fields: tuple[str, ...]) -> list[_Place]:
     """Levels of one instrument, of those readings that it has."""
-    spec: RadarSite | GnssSpec | BarometerSpec | TriadSpec = record.site if kind == "radars" else record.spec
+    spec: InstrumentSpec = record.spec
     keys = {row.name: (row.key, row.to_si) for row in table.rows}
     keys |= {row.time_constant[0]: (row.time_constant[0], 1.0) for row in table.rows if row.time_constant[0]}
     wanders = {row.time_constant[0]: row.name for row in table.rows if row.time_constant[0]}
@@ -240,7 +239,7 @@ def _has_reading(kind: str, record: Any, field: str) -> bool:
         return record.range_rate_mps is not None
     own = record.sd is not None and column is not None and bool(np.isfinite(record.sd[:, column]).any())
     if field == "angle_sd_rad":
-        both = record.site.azimuth_sd_rad is not None and record.site.elevation_sd_rad is not None
+        both = record.spec.azimuth_sd_rad is not None and record.spec.elevation_sd_rad is not None
         return not both and bool(np.isfinite(record.range_az_el[:, 1:]).any())
     return not own and (column is None or bool(np.isfinite(record.range_az_el[:, column]).any()))
 

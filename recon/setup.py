@@ -239,7 +239,7 @@ def _attitude_prior(telemetry: Telemetry, start_s: float, point_ecef_m: FloatArr
             ],
             code="attitude-missing",
         )
-    return start_attitude_from_vectors(telemetry, start_s).prior()
+    return start_attitude_from_vectors(telemetry, start_s)
 
 
 def _accelerometer_arm(sensors: InertialSensors | None) -> FloatArray:
@@ -320,7 +320,7 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     else:
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():
-        blocks += instrument_blocks(RADAR_ERRORS, radar.site)
+        blocks += instrument_blocks(RADAR_ERRORS, radar.spec)
     blocks += instrument_blocks(SITES, _sites(telemetry))
     for fixes in telemetry.gnss.values():
         blocks += instrument_blocks(GNSS, fixes.spec)

@@ -184,7 +184,7 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
 
 def _with_sites(telemetry: Telemetry, changed: Callable[[RadarSite], RadarSite]) -> Telemetry:
     """Telemetry whose radars' sites state something else."""
-    radars = {name: replace(r, site=changed(r.site)) for name, r in telemetry.radars.items()}
+    radars = {name: replace(r, spec=changed(r.spec)) for name, r in telemetry.radars.items()}
     return replace(telemetry, radars=radars)
 
 

@@ -192,7 +192,7 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
 
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
     """One line each for position, height and azimuth: on what they rest and to how much, where no residual shows it."""
-    radars = [r.site for name, r in telemetry.radars.items() if name not in settings.without]
+    radars = [r.spec for name, r in telemetry.radars.items() if name not in settings.without]
     receivers = [name for name, r in telemetry.gnss.items() if name not in settings.without and r.has_positions]
     checked = f"; checked by {', '.join(place.name for place in telemetry.places)}" if telemetry.places else ""
     if not radars and not receivers and telemetry.start.state is not None:

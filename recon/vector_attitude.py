@@ -47,6 +47,7 @@ from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_ch
 
 _QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
+_START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude and rate follow within seconds
 _TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
 LEAST_INSIDE = 0.90  # of 95 % regions, less what blocks that are not independent scatter
 _MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
@@ -191,7 +192,7 @@ def _place(
 def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and positions (k, 3), ECEF m: medians over `_TRACK_BLOCK_S` of all radar points and receiver fixes."""
     times = [r.time_s for r in telemetry.radars.values()] + [r.time_s for r in telemetry.gnss.values()]
-    points = [earth.ecef_from_radar(r.range_az_el, *r.site.geodetic) for r in telemetry.radars.values()]
+    points = [earth.ecef_from_radar(r.range_az_el, *r.spec.geodetic) for r in telemetry.radars.values()]
     points += [r.position_ecef_m for r in telemetry.gnss.values()]
     t, p = np.concatenate(times), np.concatenate(points)
     whole = np.isfinite(p).all(axis=1)
@@ -331,19 +332,6 @@ def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[
 
 
 @dataclass(frozen=True)
-class StartAttitude:
-    """Attitude at one time, and its covariance (3, 3) of the right-hand rotation in body axes, rad^2."""
-
-    time_s: float
-    q_ecef_body: FloatArray
-    covariance: FloatArray
-
-    def prior(self) -> AttitudePrior:
-        """As flight.toml would state it: standard deviations about the body axes, without their correlation."""
-        return AttitudePrior(self.time_s, self.q_ecef_body, np.sqrt(np.diagonal(self.covariance)))
-
-
-@dataclass(frozen=True)
 class AttitudeComparison:
     """History minus trajectory.
 
@@ -464,16 +452,10 @@ def _inconsistent_sensors(offsets: dict[str, FloatArray], allowed: dict[str, flo
     return f"misaligned relative to it: {listed}; check mounting, clocking and signs"
 
 
-def start_attitude_from_vectors(
-    telemetry: Telemetry,
-    around_s: float,
-    position: Position | tuple[FloatArray, FloatArray] | None = None,
-    settings: Settings | None = None,
-    span_s: float = 60.0,
-) -> StartAttitude:
-    """Attitude near a time, from the data of ``span_s`` about it, to start a filter with.
+def start_attitude_from_vectors(telemetry: Telemetry, around_s: float) -> AttitudePrior:
+    """Attitude near a time, from the data of a minute about it, as flight.toml would state it to start a filter with.
 
-    A longer span determines the sensors' constant errors better; attitude and rate themselves follow within seconds.
+    Its standard deviations are about the body axes, without their correlation.
 
     Raises
     ------
@@ -481,10 +463,11 @@ def start_attitude_from_vectors(
         As `reconstruct_attitude`, and where there are no data in the span.
     """
     magnetometer, sun = _required_vectors(telemetry)
-    begin = float(np.clip(around_s - 0.5 * span_s, sun.time_s[0], max(sun.time_s[0], sun.time_s[-1] - span_s)))
+    last_s = max(sun.time_s[0], sun.time_s[-1] - _START_SPAN_S)
+    begin = float(np.clip(around_s - 0.5 * _START_SPAN_S, sun.time_s[0], last_s))
 
     def near(record: TriadRecord | SunRecord) -> BoolArray:
-        return np.asarray((record.time_s >= begin) & (record.time_s <= begin + span_s))
+        return np.asarray((record.time_s >= begin) & (record.time_s <= begin + _START_SPAN_S))
 
     in_field, in_sun = near(magnetometer), near(sun)
     if not in_field.any() or not in_sun.any():
@@ -501,6 +484,7 @@ def start_attitude_from_vectors(
         ),
         sun=SunRecord(sun.spec, sun.time_s[in_sun], sun.az_el_head_rad[in_sun]),
     )
-    history = reconstruct_attitude(part, position, settings)
+    history = reconstruct_attitude(part)
     k = int(np.argmin(np.abs(history.time_s - around_s)))
-    return StartAttitude(float(history.time_s[k]), history.q_ecef_body[k], history.covariance[k])
+    sd_rad = np.sqrt(np.diagonal(history.covariance[k]))
+    return AttitudePrior(float(history.time_s[k]), history.q_ecef_body[k], sd_rad)

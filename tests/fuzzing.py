@@ -365,7 +365,7 @@ def flight_case(root: Path) -> tuple[Case, Case]:
 def _as_stated(telemetry: Any, spec: Any) -> str:
     """What the records say of themselves is what the file says."""
     for name, entry in spec.radars.items():
-        site = telemetry.radars[name].site
+        site = telemetry.radars[name].spec
         if (site.latitude_rad, site.height_m) != (float(np.deg2rad(entry.latitude_deg)), entry.height_m):
             return f"radar {name} does not stand where flight.toml says"
     if telemetry.accelerometer is not None:

@@ -55,7 +55,7 @@ def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.W
     """Return a tracker's positions (n, 3), ECEF m."""
     if isinstance(record, GnssRecord):
         return record.position_ecef_m
-    return earth.ecef_from_radar(record.range_az_el, *record.site.geodetic, planet)
+    return earth.ecef_from_radar(record.range_az_el, *record.spec.geodetic, planet)
 
 
 # spans of time
@@ -162,7 +162,7 @@ def _reread(
     elevation = values[:, 2][np.isfinite(values[:, 2])]
     if np.abs(elevation).max(initial=0.0) > 0.5 * np.pi or np.abs(values[:, 1]).max(initial=0.0) > 4 * np.pi:
         return None
-    return earth.ecef_from_radar(values, *record.site.geodetic, planet)
+    return earth.ecef_from_radar(values, *record.spec.geodetic, planet)
 
 
 def _share_that_falls(
@@ -314,7 +314,7 @@ def _sd_m(record: RadarRecord | GnssRecord, position_m: FloatArray, planet: eart
         return np.full(
             len(position_m), float(np.sqrt(2 * s.horizontal_sd_m**2 + s.vertical_sd_m**2 + s.wander_sd_m**2))
         )
-    site = record.site
+    site = record.spec
     at = earth.ecef_from_geodetic(*site.geodetic, planet)
     slant = np.linalg.norm(position_m - at, axis=1)
     own = [getattr(site, row.name) for row in RADAR.rows if row.unit == "rad" and row.states]

@@ -114,7 +114,7 @@ def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     """Heights by each tracker's own points, as measured."""
     planet = run.telemetry.planet
     tracks = [
-        (name, r.time_s, earth.ecef_from_radar(r.range_az_el, *r.site.geodetic, planet))
+        (name, r.time_s, earth.ecef_from_radar(r.range_az_el, *r.spec.geodetic, planet))
         for name, r in run.telemetry.radars.items()
     ]
     tracks += [(name, r.time_s, r.position_ecef_m) for name, r in run.telemetry.gnss.items() if r.has_positions]

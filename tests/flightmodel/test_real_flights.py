@@ -103,7 +103,7 @@ class TestRadar36353:
 
     def test_coast_is_free_fall_to_293_km(self, read):
         record = read("radar_36353").radars["B"]
-        s = record.site
+        s = record.spec
         rows = (record.time_s > 250.0) & (record.time_s < 310.0)
         t = record.time_s[rows] - 280.0
         p = earth.ecef_from_radar(record.range_az_el[rows], s.latitude_rad, s.longitude_rad, s.height_m)

@@ -156,10 +156,10 @@ def test_the_peak_of_a_reentry_is_lost_by_thinning_and_kept_by_states():
 
 def without_wander(record):
     """The same readings, of which all error is stated as white noise."""
-    s = record.site
+    s = record.spec
     range_sd, angle_sd = np.hypot(s.range_sd_m, s.range_wander_sd_m), np.hypot(s.angle_sd_rad, s.wander_sd_rad)
     white = replace(s, range_sd_m=range_sd, angle_sd_rad=angle_sd, range_wander_sd_m=0.0, wander_sd_rad=0.0)
-    return replace(record, site=white)
+    return replace(record, spec=white)
 
 
 def peak(time_s, velocity_mps):

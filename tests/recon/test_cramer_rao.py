@@ -49,7 +49,7 @@ def without_errors(telemetry, truth):
     force, rate = telemetry.accelerometer, telemetry.rates
     radars = {}
     for name, record in telemetry.radars.items():
-        s = record.site
+        s = record.spec
         place = truth.trajectory(record.time_s, CG).position_ecef_m
         z = earth.radar_from_ecef(place, s.latitude_rad, s.longitude_rad, s.height_m)
         radars[name] = RadarRecord(s, record.time_s, z)

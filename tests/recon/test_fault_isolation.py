@@ -26,7 +26,7 @@ FAST = Settings(output_rate_hz=5.0)
 def spoiled(telemetry, name, azimuth=0.0, seconds=0.0, noise=0.0):
     """Telemetry with one radar's azimuth turned, its tags shifted or its noise grown (to the last by ``noise`` sd)."""
     record = telemetry.radars[name]
-    site, track = record.site, record.range_az_el.copy()
+    site, track = record.spec, record.range_az_el.copy()
     track[:, 1] += azimuth
     sd = np.array([site.range_sd_m, site.angle_sd_rad / np.cos(0.8), site.angle_sd_rad])
     track += noise * sd * np.random.default_rng(1).standard_normal(track.shape)

@@ -29,7 +29,7 @@ def damaged(telemetry):
     track[16] = np.nan
     track[20:24, 0] += 900.0
     track[26, 2] += 0.05
-    return replace(telemetry, radars=telemetry.radars | {radar.site.name: RadarRecord(radar.site, radar.time_s, track)})
+    return replace(telemetry, radars=telemetry.radars | {radar.spec.name: RadarRecord(radar.spec, radar.time_s, track)})
 
 
 def wandering_bias(telemetry):

@@ -128,7 +128,7 @@ class Batch:
         both = np.repeat([FORCE.bias_sd, RATE.bias_sd], 3)
         graph.add(gtsam.PriorFactorConstantBias(B(0), gtsam.imuBias.ConstantBias(), sigmas(both)))
         for i, record in enumerate(self.radars):
-            s = record.site
+            s = record.spec
             sd = np.array([s.range_bias_sd_m, s.angle_bias_sd_rad, s.angle_bias_sd_rad, s.time_bias_sd_s])
             graph.add(gtsam.PriorFactorVector(R(i), np.zeros(4), sigmas(sd)))
             for k, z in enumerate(record.range_az_el):

@@ -19,7 +19,7 @@ def planted(telemetry, droop_rad=0.0, refraction=0.0, **stated):
     elevation = record.range_az_el[:, 2]
     added = droop_rad * np.cos(elevation) + refraction * 3.2e-4 / np.tan(elevation)
     z = record.range_az_el + np.column_stack([0.0 * added, 0.0 * added, added])
-    changed = replace(record, range_az_el=z, site=replace(record.site, **stated))
+    changed = replace(record, range_az_el=z, spec=replace(record.spec, **stated))
     return replace(telemetry, radars=telemetry.radars | {"north": changed})
 
 

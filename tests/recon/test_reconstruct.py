@@ -251,7 +251,7 @@ def test_nan_bursts_and_missing_points_are_survived(mini_sense, mini_truth):
     force[3000:3020] = np.nan
     track = telemetry.radars["west"].range_az_el.copy()
     track[100:160, 2] = np.nan
-    west = RadarRecord(telemetry.radars["west"].site, telemetry.radars["west"].time_s, track)
+    west = RadarRecord(telemetry.radars["west"].spec, telemetry.radars["west"].time_s, track)
     accelerometer = TriadRecord(telemetry.accelerometer.spec, telemetry.accelerometer.time_s, force)
     r = reconstruct(replace(telemetry, accelerometer=accelerometer, radars=telemetry.radars | {"west": west}), FAST)
     west = r.residuals[r.residuals.source == "west"]
@@ -267,7 +267,7 @@ def test_track_error_is_found_and_edited(mini_sense, mini_truth):
     telemetry, _ = mini_sense(500)
     track = telemetry.radars["north"].range_az_el.copy()
     track[200:230, 0] += 300.0
-    north = RadarRecord(telemetry.radars["north"].site, telemetry.radars["north"].time_s, track)
+    north = RadarRecord(telemetry.radars["north"].spec, telemetry.radars["north"].time_s, track)
     r = reconstruct(replace(telemetry, radars=telemetry.radars | {"north": north}), FAST)
     edited = r.residuals[~r.residuals.accepted & (r.residuals.component == "range")]
     assert len(edited) >= 30

@@ -94,7 +94,7 @@ def test_no_tracker_is_refused_in_words(mini_sense, mini_everything, everything)
     telemetry = mini_sense(1)[0] if len(everything) == 2 else mini_everything(1)
     assert faults(build, telemetry, without=everything)[0].code == "no-track-points"
     blind = {
-        name: RadarRecord(r.site, r.time_s, np.full_like(r.range_az_el, np.nan)) for name, r in telemetry.radars.items()
+        name: RadarRecord(r.spec, r.time_s, np.full_like(r.range_az_el, np.nan)) for name, r in telemetry.radars.items()
     }
     assert faults(build, replace(telemetry, radars=blind, gnss={}))[0].code == "no-track-points"
     assert faults(build, replace(telemetry, radars={}, gnss={}))[0].code == "no-track-points"
@@ -135,7 +135,7 @@ def test_a_source_that_is_left_out_chooses_nothing(mini_sense, mini_truth):
     west = telemetry.radars["west"]
     track = west.range_az_el.copy()
     track[:, 0] += 100e3
-    earlier = RadarRecord(west.site, west.time_s - 2.0, track)
+    earlier = RadarRecord(west.spec, west.time_s - 2.0, track)
     wrong = replace(telemetry, radars={"west": earlier, "north": telemetry.radars["north"]})
     problem = build(wrong, without=("west",))
     clean = build(replace(telemetry, radars={"north": telemetry.radars["north"]}))

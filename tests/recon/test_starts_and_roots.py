@@ -92,14 +92,14 @@ def test_held_out_readings_noise_is_in_what_is_predicted_of_them(mini_sense):
     # a radar that is held out moves nothing: with twice its noise stated only the prediction's variance grows, by 3
     telemetry, _ = mini_sense(1)
     west = telemetry.radars["west"]
-    assert west.site.elevation_sd_rad is None
-    noisy = replace(west.site, range_sd_m=2.0 * west.site.range_sd_m, angle_sd_rad=2.0 * west.site.angle_sd_rad)
+    assert west.spec.elevation_sd_rad is None
+    noisy = replace(west.spec, range_sd_m=2.0 * west.spec.range_sd_m, angle_sd_rad=2.0 * west.spec.angle_sd_rad)
     settings = Settings(output_rate_hz=2.0, without=("west",))
     one = reconstruct(telemetry, settings).held_out
     two = reconstruct(
-        replace(telemetry, radars=telemetry.radars | {"west": replace(west, site=noisy)}), settings
+        replace(telemetry, radars=telemetry.radars | {"west": replace(west, spec=noisy)}), settings
     ).held_out
-    for component, sd in (("range", west.site.range_sd_m), ("elevation", west.site.angle_sd_rad)):
+    for component, sd in (("range", west.spec.range_sd_m), ("elevation", west.spec.angle_sd_rad)):
         grown, was = (t[t.component == component].predicted_sd.to_numpy() for t in (two, one))
         np.testing.assert_allclose(grown**2 - was**2, 3.0 * sd**2, rtol=1e-6)
 

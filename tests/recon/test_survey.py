@@ -29,14 +29,14 @@ def resited(telemetry, latitude_rad=0.0, longitude_rad=0.0, height_m=0.0, azimut
     """Telemetry whose sites are stated elsewhere than they stand; readings whose azimuths start elsewhere."""
     radars = {}
     for name, record in telemetry.radars.items():
-        s = record.site
+        s = record.spec
         site = replace(
             s,
             latitude_rad=s.latitude_rad + latitude_rad,
             longitude_rad=s.longitude_rad + longitude_rad,
             height_m=s.height_m + height_m,
         )
-        radars[name] = replace(record, site=site, range_az_el=record.range_az_el + np.array([0.0, azimuth, 0.0]))
+        radars[name] = replace(record, spec=site, range_az_el=record.range_az_el + np.array([0.0, azimuth, 0.0]))
     return replace(telemetry, radars=radars)
 
 
@@ -126,12 +126,12 @@ def test_stated_errors_of_the_sites_are_in_the_covariance(mini_truth, mini_sense
         radars = {}
         for name, record in telemetry.radars.items():
             e = rng.standard_normal(4) * [30.0, 30.0, 40.0, 0.01 * DEG] + [east, north, up, turn]
-            s = record.site
+            s = record.spec
             true = earth.ecef_from_geodetic(s.latitude_rad, s.longitude_rad, s.height_m)
             stated = true + earth.dcm_ned_ecef(s.latitude_rad, s.longitude_rad).T @ [e[1], e[0], -e[2]]
             lat, lon, height = (float(x) for x in earth.geodetic_from_ecef(stated))
             site = replace(s, latitude_rad=lat, longitude_rad=lon, height_m=height, **own)
-            radars[name] = replace(record, site=site, range_az_el=record.range_az_el + np.array([0.0, e[3], 0.0]))
+            radars[name] = replace(record, spec=site, range_az_el=record.range_az_el + np.array([0.0, e[3], 0.0]))
         bet = reconstruct_once(replace(telemetry, radars=radars, sites=common), QUICK).smoothed
         k = len(bet.time_s) // 2
         off = (bet.position_ecef_m - mini_truth.trajectory(bet.time_s).position_ecef_m)[k]

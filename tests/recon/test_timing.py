@@ -84,8 +84,8 @@ def jittered(mini_truth, mini_sense):
         for radar, first in zip(telemetry.radars.values(), (START, START + 9.0), strict=True):
             t = np.sort(rng.uniform(first, END - 2.0, 300))
             t = t[np.diff(t, prepend=-1.0) > 1e-4]
-            z, _ = measure_radar(mini_truth, radar.site, t, rng)
-            radars[radar.site.name] = RadarRecord(radar.site, t, z)
+            z, _ = measure_radar(mini_truth, radar.spec, t, rng)
+            radars[radar.spec.name] = RadarRecord(radar.spec, t, z)
         return replace(telemetry, radars=radars)
 
     return make
@@ -154,7 +154,7 @@ def test_thinning_keeps_a_point_of_each_source_and_a_node_of_every_step(mini_eve
     telemetry = mini_everything(1)
     north = telemetry.radars["north"]
     keep = (north.time_s < 103.0) | (north.time_s > 108.0)
-    gap = RadarRecord(north.site, north.time_s[keep], north.range_az_el[keep])
+    gap = RadarRecord(north.spec, north.time_s[keep], north.range_az_el[keep])
     problem = build(replace(telemetry, radars={"north": gap}, gnss={}), output_rate_hz=20.0)
     thinned, kept = problem.thinned(0.5)
     assert kept[0] == 0

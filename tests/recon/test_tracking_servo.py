@@ -63,7 +63,7 @@ def lagging(telemetry, truth, hz=HZ, **stated):
     w = 2.0 * np.pi * hz
     radars = {}
     for name, record in telemetry.radars.items():
-        site = record.site
+        site = record.spec
         t = np.arange(record.time_s[0] - 4.0, record.time_s[-1] + 0.1, 0.02)
         place = truth.trajectory(t).position_ecef_m
         angles = earth.radar_from_ecef(place, site.latitude_rad, site.longitude_rad, site.height_m)[:, 1:]
@@ -71,7 +71,7 @@ def lagging(telemetry, truth, hz=HZ, **stated):
         behind = ([-1.0, 0.0, 0.0], [1.0, np.sqrt(2.0) * w, w * w])
         lag = np.column_stack([np.interp(record.time_s, t, signal.lsim(behind, c, t - t[0])[1]) for c in bent.T])
         z = record.range_az_el + np.column_stack([np.zeros(len(lag)), lag])
-        radars[name] = replace(record, range_az_el=z, site=replace(site, **stated))
+        radars[name] = replace(record, range_az_el=z, spec=replace(site, **stated))
     return replace(telemetry, radars=radars)
 
 

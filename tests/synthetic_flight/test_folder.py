@@ -89,11 +89,11 @@ def test_the_folder_states_every_error_that_its_trackers_were_given(tmp_path, sh
     simulate_to_folder(replace(short, spec=spec), 0, tmp_path / "a")
     telemetry = read_flight(tmp_path / "a")
     for table, drawn, stated in (
-        (RADAR, radar, telemetry.radars["r"].site),
+        (RADAR, radar, telemetry.radars["r"].spec),
         (GNSS, receiver, telemetry.gnss["g"].spec),
     ):
         for name, sizes in table.from_scenario(drawn).items():
             if any(sizes):
                 assert getattr(stated, name) == pytest.approx(np.linalg.norm(sizes), rel=1e-3), name
     assert telemetry.radars["r"].range_rate_mps is not None
-    assert telemetry.radars["r"].site.angle_servo_hz == 2.0
+    assert telemetry.radars["r"].spec.angle_servo_hz == 2.0

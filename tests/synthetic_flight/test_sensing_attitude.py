@@ -269,7 +269,7 @@ def test_rich_folder_reads_back_and_instruments_do_not_share_seeds(rich, tmp_pat
     assert told.magnetometer.spec.noise_sd == pytest.approx(0.2e-6)
     assert told.magnetometer.spec.soft_iron_sd == rich.spec.magnetometer.soft_iron
     assert told.sun.az_el_head_rad.shape[1:] == (4, 2)
-    site = told.radars["wallops_island"].site
+    site = told.radars["wallops_island"].spec
     assert site.droop_sd_rad == pytest.approx(np.deg2rad(0.0029))
     assert site.wander_time_constant_s == 20.0
     lean = read_flight(tmp_path / "part")

@@ -80,7 +80,7 @@ def test_the_lines_offered_can_be_pasted_and_hold_the_noise_that_was_drawn(run):
     offered = tomllib.loads(stated_errors.measured(run))
     assert set(offered["radars"]) == set(run.telemetry.radars)
     for name, keys in offered["radars"].items():
-        site = run.telemetry.radars[name].site
+        site = run.telemetry.radars[name].spec
         wanted = {"range_sd_m": site.range_sd_m}
         wanted |= dict.fromkeys(("azimuth_sd_deg", "elevation_sd_deg"), float(np.rad2deg(site.angle_sd_rad)))
         assert keys == pytest.approx(wanted, rel=0.1)
