@@ -15,9 +15,10 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import click
 
@@ -27,6 +28,22 @@ from postflight.streams import close_streams, leave_arrow_out, open_streams, pin
 # which five hundred searches for garbage find none: an eighth of the time of loading, here and in the second process
 gc.set_threshold(50_000, 20, 100)
 FOLDER = click.Path(path_type=Path)
+
+
+class Computing(click.Command):
+    """A command that loads pandas; its help does not."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Load pandas without Arrow, then run the command; its ``obj`` is when that began."""
+        ctx.obj = time.perf_counter()
+        leave_arrow_out()
+        return super().invoke(ctx)
+
+
+class Commands(click.Group):
+    """Commands, all of which load pandas."""
+
+    command_class = Computing
 
 
 class NamedChoice(click.Choice[str]):
@@ -43,7 +60,7 @@ class NamedChoice(click.Choice[str]):
             raise click.BadParameter(fault.message.rstrip(".") + hint, ctx, param) from None
 
 
-@click.group()
+@click.group(cls=Commands)
 def montecarlo() -> None:
     """Fly many dispersed flights, on this machine or a cluster; kill and resume at will.
 
@@ -128,7 +145,7 @@ def montecarlo_sobol(
     commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
 
 
-@click.group()
+@click.group(cls=Commands)
 def study() -> None:
     """The paper's own studies, as tables and figures beside its numbers."""
 
@@ -224,19 +241,35 @@ class FiniteRange(click.FloatRange):
         return number
 
 
+class WhatIfs(NamedTuple):
+    """What the options of `what_ifs` say, as `postflight.commands.asked` reads it."""
+
+    settings: tuple[str, ...]
+    without: tuple[str, ...]
+    rate: float | None
+    run_name: str | None
+
+
 def what_ifs(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that change a flight's assumptions or the reconstruction's settings."""
-    command = click.option("--name", "run_name", metavar="NAME", help="Of the run, to select it by.")(command)
-    command = click.option(
-        "--without", multiple=True, metavar="SOURCE", help="Leave this tracker out; repeat for several."
-    )(command)
-    return click.option(
-        "--set",
-        "settings",
-        multiple=True,
-        metavar="NAME=VALUE",
-        help="Change an assumption (c_n=1.1, mass_kg=158, wind=none) or setting (engine=filterpy); repeat for several.",
-    )(command)
+    """Add the options that change a flight's assumptions or the reconstruction's settings; the command takes them all
+    as ``changed``.
+    """
+
+    @wraps(command)
+    def taking(**options: Any) -> None:
+        changed = WhatIfs(**{name: options.pop(name) for name in WhatIfs._fields})
+        command(changed=changed, **options)
+
+    words = "Change an assumption (c_n=1.1, mass_kg=158, wind=none) or setting (engine=filterpy); repeat for several."
+    added = (
+        click.option("--name", "run_name", metavar="NAME", help="Of the run, to select it by."),
+        click.option("--without", multiple=True, metavar="SOURCE", help="Leave this tracker out; repeat for several."),
+        click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help=words),
+        click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20."),
+    )
+    for option in added:
+        taking = option(taking)
+    return taking
 
 
 def of_run(command: Callable[..., None]) -> Callable[..., None]:
@@ -247,7 +280,7 @@ def of_run(command: Callable[..., None]) -> Callable[..., None]:
     return click.option("--run", "wanted", metavar="RUN", help=words)(command)
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="postflight")
 def cli() -> None:
     """What an entry vehicle really did, and how far its flexible aeroshell deflected.
@@ -264,7 +297,6 @@ def demo(folder: Path, seed: int) -> None:
 
     Writes a flight folder (default ./demo-flight, replaced when it is one already) with results and figures.
     """
-    leave_arrow_out()
     from postflight import commands
 
     commands.demo(folder, seed)
@@ -288,22 +320,13 @@ def simulate(arguments: tuple[str, ...], seed: int, force: bool) -> None:
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
 @click.option("--sensitivity", is_flag=True, help="Also rerun without each source, wind, and with other air and mass.")
 @what_ifs
-def reconstruct(
-    folder: Path,
-    rate: float | None,
-    sensitivity: bool,
-    settings: tuple[str, ...],
-    without: tuple[str, ...],
-    run_name: str | None,
-) -> None:
+def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
     """Reconstruct the best-estimated trajectory of the flight in FOLDER."""
-    leave_arrow_out()
     from postflight import commands
 
-    commands.run(folder, (), commands.asked(settings, without, rate, run_name), sensitivity)
+    commands.run(folder, (), commands.asked(*changed), sensitivity)
 
 
 @cli.command()
@@ -328,7 +351,6 @@ def reconstruct(
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
     """Estimate how far the aeroshell deflected in the flight in FOLDER."""
-    leave_arrow_out()
     from postflight import commands
 
     commands.deflection(folder, methods, plane, joint, film)
@@ -359,21 +381,16 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 
 @cli.command()
 @click.argument("folder", type=FOLDER)
-@click.option("--rate", type=FiniteRange(1.0, 200.0), help="Output rate, Hz; default: flight.toml's, or 20.")
 @click.option("--timings", is_flag=True, help="Print how long each stage took.")
 @what_ifs
-def run(
-    folder: Path, rate: float | None, settings: tuple[str, ...], without: tuple[str, ...], run_name: str | None,
-    timings: bool,
-) -> None:  # fmt: skip
+@click.pass_obj
+def run(begun: float, folder: Path, timings: bool, changed: WhatIfs) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
-    begun = time.perf_counter()
-    leave_arrow_out()
     from postflight import commands
     from postflight.deflections import METHODS
 
     stages = commands.Stages(begun)
-    commands.run(folder, METHODS, commands.asked(settings, without, rate, run_name), stages=stages)
+    commands.run(folder, METHODS, commands.asked(*changed), stages=stages)
     if timings:
         commands.print_stages(stages)
 
@@ -396,7 +413,6 @@ def noise(folder: Path, accept: bool) -> None:
 @click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
 def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
-    leave_arrow_out()
     from postflight.reconciliation import command
 
     command.run(folder, ("freeplay",) * freeplay + ("creep",) * creep + ("hardening",) * hardening, posterior)
