@@ -188,6 +188,12 @@ class TimeColumn:
             object.__setattr__(self, "parts", (self.column,))
 
 
+def column_about(column: str, what: str = "sd") -> str:
+    """Name of the column of something about another: ``alt_m`` and ``sd`` make ``alt_sd_m``, ``mach`` ``mach_sd``."""
+    stem, _, unit = column.rpartition("_")
+    return f"{stem}_{what}_{unit}" if stem and unit in UNITS else f"{column}_{what}"
+
+
 def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     """Read a CSV as text; ``attrs["lines"]`` holds each row's line in the file.
 

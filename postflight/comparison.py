@@ -21,6 +21,7 @@ import pandas as pd
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory
+from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.deflections import METHODS
@@ -32,13 +33,13 @@ MOST_RUNS = 6  # that strokes and colours keep apart
 INDEPENDENT, CORRELATED = "independent", "correlated"
 # quantity, its unit, its column in bet.csv and that of its sd
 TRAJECTORY = (
-    ("dynamic pressure", "Pa", "dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    ("Mach number", "", "mach", "mach_sd"),
-    ("total angle of attack", "deg", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    ("altitude", "m", "alt_m", "alt_sd_m"),
-    ("airspeed", "m/s", "airspeed_mps", "airspeed_sd_mps"),
-    ("C_A", "", "c_a", "c_a_sd"),
-    ("C_N", "", "c_n", "c_n_sd"),
+    ("dynamic pressure", "Pa", "dynamic_pressure_pa"),
+    ("Mach number", "", "mach"),
+    ("total angle of attack", "deg", "alpha_total_wind_deg"),
+    ("altitude", "m", "alt_m"),
+    ("airspeed", "m/s", "airspeed_mps"),
+    ("C_A", "", "c_a"),
+    ("C_N", "", "c_n"),
 )
 _APART = (("position_m", slice(0, 3), 1.0), ("velocity_mps", slice(3, 6), 1.0), ("attitude_deg", slice(6, 9), None))
 
@@ -50,11 +51,6 @@ class Quantity:
     words: str
     unit: str
     column: str
-
-    def named(self, what: str) -> str:
-        """Column of something about the quantity: ``alt_m`` and ``sd`` make ``alt_sd_m``."""
-        stem, _, unit = self.column.rpartition("_")
-        return f"{stem}_{what}_{unit}" if self.unit else f"{self.column}_{what}"
 
 
 @dataclass(frozen=True)
@@ -96,7 +92,7 @@ class RunComparison(Tabular):
         found = [Quantity(f"deflection: {m}", "deg", f"deflection_{m}_deg") for m in methods]
         found += [Quantity(f"largest: {m}", "deg", f"largest_{m}_deg") for m in methods]
         found += [Quantity("time of peak q", "s", "peak_s")]
-        found += [Quantity(words, unit, column) for words, unit, column, _ in TRAJECTORY]
+        found += [Quantity(words, unit, column) for words, unit, column in TRAJECTORY]
         return tuple(q for q in found if any(np.isfinite(own.get(q.column, (np.nan,))[0]) for own in self.values))
 
     @cached_property
@@ -126,7 +122,7 @@ class RunComparison(Tabular):
         for k, run in enumerate(self.runs):
             row: dict[str, Any] = _about(run) | {"label": self.labels[k], "t_s": self.at_s[k]}
             for q in self.quantities:
-                row[q.column], row[q.named("sd")] = self.value(k, q)
+                row[q.column], row[column_about(q.column, "sd")] = self.value(k, q)
             checks = run.checks["passed"]
             rows.append(row | {"checks_passed": int(checks.sum()), "checks": len(checks)})
         return pd.DataFrame(rows).dropna(axis=1, how="all")
@@ -138,7 +134,7 @@ class RunComparison(Tabular):
             row: dict[str, Any] = {"run": run.path.name, "against": self.runs[0].path.name, "errors": relation.kind}
             row["why"] = relation.words
             for q in self.quantities:
-                names = [q.named(f"difference{end}") for end in ("", "_sd", "_sd_low", "_sd_high")]
+                names = [column_about(q.column, f"difference{end}") for end in ("", "_sd", "_sd_low", "_sd_high")]
                 row |= dict(zip(names, self.apart(k, q), strict=True))
             rows.append(row)
         return pd.DataFrame(rows).dropna(axis=1, how="all")
@@ -217,9 +213,9 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
     bet, nothing = run.tables["bet"], (float("nan"), float("nan"))
     out = {"peak_s": (run.peak_s, np.nan)}
     inside = bet["t_s"].iloc[0] <= at_s <= bet["t_s"].iloc[-1]
-    for _, _, column, sd_column in TRAJECTORY:
+    for _, _, column in TRAJECTORY:
         known = inside and bet[column].notna().any()
-        out[column] = _near(bet, column, sd_column, at_s) if known else nothing
+        out[column] = _near(bet, column, at_s) if known else nothing
     loaded = bet["t_s"][pressure_pulse(np.nan_to_num(bet["dynamic_pressure_pa"].to_numpy(dtype=float)))]
     for method in METHODS:
         history = run.history(method)
@@ -232,13 +228,13 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
     return out
 
 
-def _near(bet: pd.DataFrame, column: str, sd_column: str, at_s: float) -> tuple[float, float]:
+def _near(bet: pd.DataFrame, column: str, at_s: float) -> tuple[float, float]:
     """Value and sd from the rows that hold one; NaN where none is near."""
     known = bet[bet[column].notna()]
     step = float(np.median(np.diff(bet["t_s"])))
     if np.abs(known["t_s"] - at_s).min() > step or len(known) < 4:
         return float("nan"), float("nan")
-    return value_and_sd(known, column, sd_column, at_s)
+    return value_and_sd(known, column, at_s)
 
 
 def _relation(first: RunTables, other: RunTables) -> Relation:
@@ -259,7 +255,7 @@ def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
         raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "no-common-time")
     t = a["t_s"][rows].to_numpy(float)
     out = {"t_s": t, "run": ""} | _vectors(a[rows], b)
-    for _, _, column, _ in TRAJECTORY:
+    for _, _, column in TRAJECTORY:
         out[column] = np.interp(t, b["t_s"], b[column]) - a[column][rows].to_numpy(float)
     for method in METHODS:
         both = [history for run in (first, other) if (history := run.history(method)) is not None]

@@ -20,6 +20,7 @@ from flightmodel.airdata import AirData, derived_with_sd, is_angle
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
 from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.events import find_peak
+from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory
@@ -43,35 +44,35 @@ from recon.settings import Settings
 from recon.survey import rests_on
 
 Columns = dict[str, FloatArray]
-# quantity of `airdata.derived`, its column, and the column of its sd
+# quantity of `airdata.derived` and its column
 _DERIVED = {
-    "latitude": ("lat_deg", "lat_sd_deg"),
-    "longitude": ("lon_deg", "lon_sd_deg"),
-    "altitude": ("alt_m", "alt_sd_m"),
-    "speed_inertial": ("speed_inertial_mps", "speed_inertial_sd_mps"),
-    "path_inertial": ("flight_path_inertial_deg", "flight_path_inertial_sd_deg"),
-    "heading_inertial": ("heading_inertial_deg", "heading_inertial_sd_deg"),
-    "speed_ground": ("speed_ground_mps", "speed_ground_sd_mps"),
-    "path_ground": ("flight_path_deg", "flight_path_sd_deg"),
-    "heading_ground": ("heading_deg", "heading_sd_deg"),
-    "speed_wind": ("airspeed_mps", "airspeed_sd_mps"),
-    "path_wind": ("flight_path_wind_deg", "flight_path_wind_sd_deg"),
-    "heading_wind": ("heading_wind_deg", "heading_wind_sd_deg"),
-    "roll": ("roll_ned_deg", "roll_ned_sd_deg"),
-    "pitch": ("pitch_ned_deg", "pitch_ned_sd_deg"),
-    "yaw": ("yaw_ned_deg", "yaw_ned_sd_deg"),
-    "mach": ("mach", "mach_sd"),
-    "dynamic_pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    "density": ("rho_kgpm3", "rho_sd_kgpm3"),
-    "pressure": ("p_pa", "p_sd_pa"),
-    "temperature": ("t_k", "t_sd_k"),
-    "alpha": ("alpha_deg", "alpha_sd_deg"),
-    "beta": ("beta_deg", "beta_sd_deg"),
-    "alpha_total_wind": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    "alpha_total_ground": ("alpha_total_ground_deg", "alpha_total_ground_sd_deg"),
-    "alpha_total_inertial": ("alpha_total_inertial_deg", "alpha_total_inertial_sd_deg"),
-    "clock_wind": ("clock_lv_deg", "clock_lv_sd_deg"),
-    "clock_inertial": ("clock_inertial_lv_deg", "clock_inertial_lv_sd_deg"),
+    "latitude": "lat_deg",
+    "longitude": "lon_deg",
+    "altitude": "alt_m",
+    "speed_inertial": "speed_inertial_mps",
+    "path_inertial": "flight_path_inertial_deg",
+    "heading_inertial": "heading_inertial_deg",
+    "speed_ground": "speed_ground_mps",
+    "path_ground": "flight_path_deg",
+    "heading_ground": "heading_deg",
+    "speed_wind": "airspeed_mps",
+    "path_wind": "flight_path_wind_deg",
+    "heading_wind": "heading_wind_deg",
+    "roll": "roll_ned_deg",
+    "pitch": "pitch_ned_deg",
+    "yaw": "yaw_ned_deg",
+    "mach": "mach",
+    "dynamic_pressure": "dynamic_pressure_pa",
+    "density": "rho_kgpm3",
+    "pressure": "p_pa",
+    "temperature": "t_k",
+    "alpha": "alpha_deg",
+    "beta": "beta_deg",
+    "alpha_total_wind": "alpha_total_wind_deg",
+    "alpha_total_ground": "alpha_total_ground_deg",
+    "alpha_total_inertial": "alpha_total_inertial_deg",
+    "clock_wind": "clock_lv_deg",
+    "clock_inertial": "clock_inertial_lv_deg",
 }
 _NEED_ATTITUDE = ("roll", "pitch", "yaw", "alpha", "beta", "clock", "alpha_total")
 _FORCE_NAMES = (
@@ -374,9 +375,9 @@ def _derived(flight: Reconstruction) -> Columns:
     """Air data, flow angles and attitude angles; winds."""
     value, sd = derived_with_sd(flight.solution.smoothed, flight.profile, _arm(flight.telemetry.vehicle))
     out: Columns = {}
-    for name, (column, sd_column) in _DERIVED.items():
+    for name, column in _DERIVED.items():
         unknown = not flight.has_attitude and name.startswith(_NEED_ATTITUDE)
-        for key, numbers in ((column, value[name]), (sd_column, sd[name])):
+        for key, numbers in ((column, value[name]), (column_about(column), sd[name])):
             out[key] = np.full(len(numbers), np.nan) if unknown else np.rad2deg(numbers) if is_angle(name) else numbers
     air = flight.air
     for kind in ("wind", "ground", "inertial"):  # to first order, as the estimators have them

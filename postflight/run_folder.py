@@ -35,6 +35,7 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import mean_over
 from flightmodel.earth import WGS84, name_of
 from flightmodel.files import abandoned, open_file, partial_path, write_file, writing
+from flightmodel.tables import column_about
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
@@ -67,23 +68,16 @@ _FRAMES = {
 }
 _DEGREES = {"rad": "deg", "rad/s": "deg/s"}
 _STATISTICS = ("source", "component", "unit", "count", "edited", "mean", "sd", "rms_normalised", "lag1", "nis")
-# peak of the size of which column of bet.csv, and the column of its standard deviation
+# peak of the size of which column of bet.csv
 _PEAKS = {
-    "dynamic pressure": ("dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    "Mach number": ("mach", "mach_sd"),
-    "airspeed": ("airspeed_mps", "airspeed_sd_mps"),
-    "axial deceleration": ("ax_cg_mps2", "ax_cg_sd_mps2"),
-    "total angle of attack in the pulse": ("alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    "altitude": ("alt_m", "alt_sd_m"),
+    "dynamic pressure": "dynamic_pressure_pa",
+    "Mach number": "mach",
+    "airspeed": "airspeed_mps",
+    "axial deceleration": "ax_cg_mps2",
+    "total angle of attack in the pulse": "alpha_total_wind_deg",
+    "altitude": "alt_m",
 }
-_EVENT_COLUMNS = {
-    "alt_m": "alt_sd_m",
-    "speed_ground_mps": "speed_ground_sd_mps",
-    "flight_path_deg": "flight_path_sd_deg",
-    "mach": "mach_sd",
-    "dynamic_pressure_pa": "dynamic_pressure_sd_pa",
-    "alpha_total_wind_deg": "alpha_total_wind_sd_deg",
-}
+_EVENT_COLUMNS = ("alt_m", "speed_ground_mps", "flight_path_deg", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg")
 
 
 class RunFolder:
@@ -489,38 +483,32 @@ def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     rows = []
     for name, t in sorted(named, key=lambda event: event[1]):
         row: dict[str, object] = {"event": name, "t_s": t}
-        for column, sd_column in _EVENT_COLUMNS.items():
-            row[column], sd = value_and_sd(table, column, sd_column, t)
-            row[_three_sd(column)] = 3.0 * sd
+        for column in _EVENT_COLUMNS:
+            row[column], sd = value_and_sd(table, column, t)
+            row[column_about(column, "3sd")] = 3.0 * sd
         rows.append(row)
-    names = [c for column in _EVENT_COLUMNS for c in (column, _three_sd(column))]
+    names = [c for column in _EVENT_COLUMNS for c in (column, column_about(column, "3sd"))]
     return pd.DataFrame(rows, columns=["event", "t_s", *names])
 
 
-def value_and_sd(table: pd.DataFrame, column: str, sd_column: str, at_s: float) -> tuple[float, float]:
+def value_and_sd(table: pd.DataFrame, column: str, at_s: float) -> tuple[float, float]:
     """Value of a column of ``bet.csv`` at a time, and its standard deviation, in the column's unit."""
-    time_s, values, sd = (table[name].to_numpy(dtype=float) for name in ("t_s", column, sd_column))
+    time_s, values, sd = (table[name].to_numpy(dtype=float) for name in ("t_s", column, column_about(column)))
     value = events.value_at(time_s, values, at_s)
     # a cubic through a touch of zero may pass below it
     return max(value, 0.0) if values.min() >= 0.0 else value, float(np.interp(at_s, time_s, sd))
-
-
-def _three_sd(column: str) -> str:
-    """``alt_m`` to ``alt_3sd_m``."""
-    stem, _, unit = column.rpartition("_")
-    return f"{stem}_3sd_{unit}" if stem else f"{column}_3sd"
 
 
 def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Peak values with times and standard deviations; ``inside`` is false where one lies at an end of the data."""
     peaks = dict(_PEAKS)
     if flight.deceleration is not None:
-        peaks |= {"deceleration": ("deceleration_mps2", "deceleration_sd_mps2")}
-        table = table.assign(**dict(zip(peaks["deceleration"], flight.deceleration, strict=True)))
+        column = peaks["deceleration"] = "deceleration_mps2"
+        table = table.assign(**dict(zip((column, column_about(column)), flight.deceleration, strict=True)))
     q = table["dynamic_pressure_pa"].to_numpy()
     pulse, time_s = q >= 0.5 * q.max(), table["t_s"].to_numpy()
     rows = []
-    for name, (column, sd_column) in peaks.items():
+    for name, column in peaks.items():
         size = np.abs(table[column].to_numpy(dtype=float))
         use = np.isfinite(size) & (pulse if "pulse" in name else size > -1.0)
         if name in ("Mach number", "airspeed"):
@@ -532,7 +520,7 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
         first = int(np.clip(k - 1, 0, len(size) - 3))
         near = slice(first, first + 3)
         at = events.find_peak(time_s[near], size[near])[0] if use[near].all() else time_s[k]
-        rows.append((name, column, at, *value_and_sd(table, column, sd_column, at), inside))
+        rows.append((name, column, at, *value_and_sd(table, column, at), inside))
     return pd.DataFrame(rows, columns=["peak", "column", "t_s", "value", "sd", "inside"])
 
 

@@ -24,6 +24,7 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import air_data, pressure_pulse
 from flightmodel.checks import FloatArray, GateError, Progress
+from flightmodel.tables import column_about
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
 from postflight.flight import Flight, calm, with_density, with_mass
@@ -38,17 +39,17 @@ COLUMNS = (
     "rerun", "quantity", "unit", "t_s", "base", "base_sd", "change", "change_over_sd", "expected_sd",
     "change_over_expected_sd", "largest_change", "largest_at_s", "reason",
 )  # fmt: skip
-# quantity: its unit, and its columns in bet.csv; day_kgpm3 is the sounding's density times the ratio found
+# quantity: its unit, and its column in bet.csv; day_kgpm3 is the sounding's density times the ratio found
 DERIVED = {
-    "altitude": ("m", "alt_m", "alt_sd_m"),
-    "total angle of attack": ("deg", "alpha_total_wind_deg", "alpha_total_wind_sd_deg"),
-    "Mach number": ("1", "mach", "mach_sd"),
-    "dynamic pressure": ("Pa", "dynamic_pressure_pa", "dynamic_pressure_sd_pa"),
-    "density of the day": ("kg/m^3", "day_kgpm3", "day_sd_kgpm3"),
-    "density ratio": ("1", "density_ratio", "density_ratio_sd"),
-    "C_A": ("1", "c_a", "c_a_sd"),
-    "C_N": ("1", "c_n", "c_n_sd"),
-    "C_N/C_A": ("1", "cn_over_ca", "cn_over_ca_sd"),
+    "altitude": ("m", "alt_m"),
+    "total angle of attack": ("deg", "alpha_total_wind_deg"),
+    "Mach number": ("1", "mach"),
+    "dynamic pressure": ("Pa", "dynamic_pressure_pa"),
+    "density of the day": ("kg/m^3", "day_kgpm3"),
+    "density ratio": ("1", "density_ratio"),
+    "C_A": ("1", "c_a"),
+    "C_N": ("1", "c_n"),
+    "C_N/C_A": ("1", "cn_over_ca"),
 }
 # quantity: its unit, its index in the trajectory's errors in NED and body axes, and its scale
 DIRECT = {
@@ -232,8 +233,8 @@ class View:
         turn = _turn(path)
         assert path.covariance is not None
         spread = np.sqrt(np.diagonal(turn @ path.covariance @ np.swapaxes(turn, 1, 2), axis1=1, axis2=2))
-        value = {name: table[column].to_numpy(dtype=float) for name, (_, column, _) in DERIVED.items()}
-        sd = {name: table[column].to_numpy(dtype=float) for name, (_, _, column) in DERIVED.items()}
+        value = {name: table[column].to_numpy(dtype=float) for name, (_, column) in DERIVED.items()}
+        sd = {name: table[column_about(column)].to_numpy(dtype=float) for name, (_, column) in DERIVED.items()}
         velocity = np.einsum("nij,nj->ni", turn[:, 3:6, 3:6], path.velocity_ecef_mps)
         for name, (_, k, scale) in DIRECT.items():
             known = flight.has_attitude or k < 6
