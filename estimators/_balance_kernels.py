@@ -199,6 +199,16 @@ def _state(swing, i):
     return swing[0, i, 0], swing[0, i, 1], swing[1, i, 0], swing[1, i, 1], swing[2, i, 0], swing[2, i, 1]
 
 
+@inlined
+def _force_and_flow(v, swing, i, force, rate, turning, flow, airspeed):
+    """Axes of the shell, specific force along them and flow at its nose (y, z, total angle) at one time."""
+    state, w = _state(swing, i), _vector(rate[i], 0)
+    turn = _axes(state[0], state[1])
+    f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
+    y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
+    return turn, la.back(turn, f[0], f[1], f[2]), y, z, alpha
+
+
 @kernel
 def force_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, table, out):
     """Tilt of the force against the shell less the air's, shell y, z, rad, into ``out`` (n, 2).
@@ -207,11 +217,7 @@ def force_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, tabl
     (n, 2), ``mach`` and ``airspeed`` (n,) the loads; ``knots`` (m,) and ``table`` (m, a, 4) the coefficients.
     """
     for i in range(len(out)):
-        state, w = _state(swing, i), _vector(rate[i], 0)
-        turn = _axes(state[0], state[1])
-        f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
-        f = la.back(turn, f[0], f[1], f[2])
-        y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
+        turn, f, y, z, alpha = _force_and_flow(v, swing, i, force, rate, turning, flow, airspeed)
         axial, ny, nz, _, _ = _air(v, turn, y, z, _coefficients(mach[i], alpha, knots, table))
         lateral = math.hypot(f[1], f[2])
         tilt = math.atan2(lateral, -f[0]) / lateral if lateral > 0.0 else 0.0
@@ -226,11 +232,7 @@ def force_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, tabl
 def axial_left(v, swing, force, rate, turning, flow, mach, airspeed, knots, table, out):
     """Logarithm of the specific force along the shell's axis over C_A, into ``out`` (n, 1); see above."""
     for i in range(len(out)):
-        state, w = _state(swing, i), _vector(rate[i], 0)
-        turn = _axes(state[0], state[1])
-        f = _specific_force(v, state, _vector(force[i], 0), w, _vector(turning[i], 0))
-        f = la.back(turn, f[0], f[1], f[2])
-        y, z, alpha = _nose_flow(v, state, turn, w, airspeed[i], flow[i, 0], flow[i, 1])
+        turn, f, y, z, alpha = _force_and_flow(v, swing, i, force, rate, turning, flow, airspeed)
         ratio = -f[0] / _air(v, turn, y, z, _coefficients(mach[i], alpha, knots, table))[0]
         out[i, 0] = math.log(ratio) if ratio > 0.0 else math.nan
 

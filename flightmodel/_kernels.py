@@ -289,6 +289,18 @@ def boxplus(q, d0, d1, d2):
 
 
 @inlined
+def multiply(a, b, rows, between, columns, out):
+    """``out = a b`` of leading rows and columns; neither shares memory with ``out``."""
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = 0.0
+        for k in range(between):
+            f = a[i, k]
+            for j in range(columns):
+                out[i, j] += f * b[k, j]
+
+
+@inlined
 def small_cholesky(s, count, factor):
     """Lower factor of the leading ``count`` rows of ``s``, of a few unknowns; it may take the place of ``s``.
 

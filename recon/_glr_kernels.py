@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import inlined, kernel
+from flightmodel._kernels import inlined, kernel, multiply
 from recon._measurement_kernels import SLOTS
 
 
@@ -186,13 +186,7 @@ def adjoint_update(
         mean[column[a]] = response[a]
     if not wanted:
         return
-    for i in range(size):
-        for a in range(count):
-            out[i, a] = 0.0
-        for j in range(size):
-            f = information[i, j]
-            for a in range(count):
-                out[i, a] += f * rest[j, a]
+    multiply(information, rest, size, size, count, out)
     for i in range(size):
         for a in range(count):
             information[i, column[a]] = out[i, a]

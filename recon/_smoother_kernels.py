@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import inlined, kernel
+from flightmodel._kernels import inlined, kernel, multiply
 
 LEAST_PIVOT = 1e-14  # of a correlation matrix; below it a direction is known exactly
 
@@ -149,13 +149,7 @@ def backward_gain(phi, noise, decay, noise_var, moving, still, p, columns, scale
                 for t in range(d):
                     added[t, i] -= phi[i, moving[r]] * added[t, r]
     invert_kinematic(phi, square, inverse)
-    for i in range(9):
-        for j in range(size):
-            columns[i, j] = 0.0
-        for k in range(9):
-            f = inverse[i, k]
-            for j in range(size):
-                columns[i, j] += f * gain[k, j]
+    multiply(inverse, gain, 9, 9, size, columns)
     for i in range(9):
         for j in range(size):
             gain[i, j] = columns[i, j]
@@ -211,13 +205,7 @@ def rauch_tung_striebel(steps, run, moving, x, covariance, variance):
             x[k, moving[r]] += value - step[moving[r]]
         if not wanted:
             continue
-        for r in range(d):
-            for j in range(size):
-                rows[r, j] = 0.0
-            for col in range(size):
-                f = gain[r, col]
-                for j in range(size):
-                    rows[r, j] += f * p[col, j]
+        multiply(gain, p, d, size, size, rows)
         for r in range(d):
             for t in range(r + 1):
                 value = 0.5 * (added[r, t] + added[t, r])
