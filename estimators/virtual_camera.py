@@ -60,22 +60,17 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class ProjectedEdge:
-    """The shell's edge in the picture, ``n`` points in the lens's field, from small to large clocking angles.
+class ProjectedEdge(Sight):
+    """The shell's edge, points in the lens's field alone, from small to large clocking angles.
 
     Parameters
     ----------
-    pixels : (n, 2) float
     inward_px : (n, 2) float
         Unit normals towards the shell.
-    jacobian : (n, 2, 16) float
-        See the columns above.
     clocks_rad : (n,) float
     """
 
-    pixels: FloatArray
     inward_px: FloatArray
-    jacobian: FloatArray
     clocks_rad: FloatArray
 
 
@@ -196,7 +191,7 @@ class VirtualCamera:
         tangent /= np.hypot(tangent[:, 0], tangent[:, 1])[:, None]
         # clocking angles grow to the left, so the shell lies to the left along the edge
         inward = np.column_stack([tangent[:, 1], -tangent[:, 0]])
-        return ProjectedEdge(pixels, inward, sight.jacobian[inside], self.clocks_rad[inside])
+        return ProjectedEdge(pixels, sight.jacobian[inside], inward, self.clocks_rad[inside])
 
     def _unflattened(self, points: FloatArray, flattening: float) -> FloatArray:
         """Points ``(n, 3)`` of the shell before it flattened."""

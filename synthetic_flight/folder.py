@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,13 +27,14 @@ import numpy as np
 
 from flightmodel import earth, tables
 from flightmodel.checks import FloatArray, GateError, Progress
+from flightmodel.config import Section
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.events import descent_events, find_peak, first_fall, has_peak, splashdown_index, values_at
 from flightmodel.files import abandoned, partial_path, writing
-from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN
+from flightmodel.instruments import ACCELEROMETER, GNSS, MAGNETOMETER, RADAR, RATES, SUN, InstrumentTable
 from synthetic_flight import sensing, weather
 from synthetic_flight.film import write_videos
-from synthetic_flight.instrument_errors import Magnetometer, SunSensors, Video, stated_errors
+from synthetic_flight.instrument_errors import Video, stated_errors
 from synthetic_flight.scenarios import Scenario, child_rng, fly_scenario
 from synthetic_flight.simulate import Truth
 
@@ -253,7 +255,7 @@ def _text(value: str) -> str:
 def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
     """Return ``flight.toml`` with the errors of the data sheets, without anything that was drawn."""
     spec = scenario.spec
-    acc, gyro = spec.accelerometer, spec.rates
+    acc = spec.accelerometer
     lines = [
         "# SYNTHETIC flight, written by postflight simulate. Nothing in truth/ may be used to estimate.",
         f"name = {_text(spec.name)}",
@@ -265,43 +267,31 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
         f"t_s = {spec.attitude_prior.t_s}",
         f"q_ecef_body = [{', '.join(f'{x:.6f}' for x in q_prior)}]",
         f"sd_deg = {spec.attitude_prior.sd_deg}",
-        "",
-        "[sensors.accelerometer]",
-        'file = "telemetry/accelerometer.csv"',
-        f'mount = "{acc.mount}"',
-        *stated_errors(ACCELEROMETER, acc),
-        *stated_errors(ACCELEROMETER, acc, if_there=True),
-        *_accelerometer_columns(acc.mount),
-        "",
-        "[sensors.rates]",
-        'file = "telemetry/rates.csv"',
-        *stated_errors(RATES, gyro),
-        *stated_errors(RATES, gyro, if_there=True),
     ]
-    lines += _magnetometer_lines(spec.magnetometer) + _sun_lines(spec.sun)
+    lines += _table("sensors.accelerometer", "accelerometer", [f'mount = "{acc.mount}"'], ACCELEROMETER, acc)
+    lines += _accelerometer_columns(acc.mount)
+    lines += _table("sensors.rates", "rates", [], RATES, spec.rates)
+    if spec.magnetometer is not None:
+        mount = f'mount = "{spec.magnetometer.mount}"'
+        lines += _table("sensors.magnetometer", "magnetometer", [mount], MAGNETOMETER, spec.magnetometer)
+    if spec.sun is not None:
+        heads = f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.sun.heads_lv_deg)}]"
+        lines += _table("sensors.sun", "sun", [heads, f"field_deg = {spec.sun.field_deg}"], SUN, spec.sun)
     for name, radar in spec.radars.items():
-        lines += [
-            "",
-            f"[radars.{name}]",
-            f'file = "telemetry/radar_{name}.csv"',
+        place = [
             f"latitude_deg = {radar.latitude_deg}",
             f"longitude_deg = {radar.longitude_deg}",
             f"height_m = {radar.height_m}",
             *(['measures = ["range", "az", "el", "range_rate"]'] if radar.range_rate_sd_mps > 0.0 else []),
-            *stated_errors(RADAR, radar),
+        ]
+        tracking = [
             *([f'tracks = "{radar.tracks}"'] if radar.tracks != "cg" else []),
             *([f"angle_servo_hz = {radar.angle_servo_hz}"] if radar.angle_servo_hz > 0.0 else []),
-            *stated_errors(RADAR, radar, if_there=True),
         ]
+        lines += _table(f"radars.{name}", f"radar_{name}", place, RADAR, radar, tracking)
     for name, receiver in spec.gnss.items():
-        lines += [
-            "",
-            f"[gnss.{name}]",
-            f'file = "telemetry/gnss_{name}.csv"',
-            f"antenna_from_datum_body_m = {list(receiver.antenna_from_datum_body_m)}",
-            *stated_errors(GNSS, receiver),
-            *stated_errors(GNSS, receiver, if_there=True),
-        ]
+        antenna = f"antenna_from_datum_body_m = {list(receiver.antenna_from_datum_body_m)}"
+        lines += _table(f"gnss.{name}", f"gnss_{name}", [antenna], GNSS, receiver)
     lines += ["", "[atmosphere]", 'file = "telemetry/atmosphere.csv"']
     if spec.video is not None:
         lines += _video_lines("frames", "frames.csv", spec.video.camera, spec.video)
@@ -334,30 +324,12 @@ def _video_lines(table: str, listed: str, name: str, video: Video) -> list[str]:
     ]
 
 
-def _magnetometer_lines(spec: Magnetometer | None) -> list[str]:
-    if spec is None:
-        return []
-    return [
-        "",
-        "[sensors.magnetometer]",
-        'file = "telemetry/magnetometer.csv"',
-        f'mount = "{spec.mount}"',
-        *stated_errors(MAGNETOMETER, spec),
-        *stated_errors(MAGNETOMETER, spec, if_there=True),
-    ]
-
-
-def _sun_lines(spec: SunSensors | None) -> list[str]:
-    if spec is None:
-        return []
-    return [
-        "",
-        "[sensors.sun]",
-        'file = "telemetry/sun.csv"',
-        f"heads_lv_deg = [{', '.join(str(clock) for clock in spec.heads_lv_deg)}]",
-        f"field_deg = {spec.field_deg}",
-        *stated_errors(SUN, spec),
-    ]
+def _table(
+    name: str, file: str, about: list[str], errors: InstrumentTable, spec: Section, more: Sequence[str] = ()
+) -> list[str]:
+    """Table of an instrument: its file, what is ``about`` it, the errors that it always states and those it has."""
+    stated, there = stated_errors(errors, spec), stated_errors(errors, spec, if_there=True)
+    return ["", f"[{name}]", f'file = "telemetry/{file}.csv"', *about, *stated, *more, *there]
 
 
 SUTTON_GRAVES = 1.7415e-4
