@@ -472,16 +472,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
 
 
 def read_flight(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Telemetry:
-    """Read everything measured on one flight.
-
-    Parameters
-    ----------
-    folder : Path
-        Flight folder with ``flight.toml``.
-    progress : callable, optional
-        Called with the fraction of the large tables that is read.
-    needs_path : bool
-        Whether a folder without radar and receiver is refused even where it has a film.
+    """Read everything measured on one flight; parameters as of `read_sources`.
 
     Raises
     ------

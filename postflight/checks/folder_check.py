@@ -222,10 +222,10 @@ def _cross_check(found: Sources, report: Report) -> None:
     whole = {name: t for name, t in found.triads.items() if np.isfinite(t.measured_sensor).any(axis=0).all()}
     found, remarks = replace(found, triads=whole), report.cross_checks
     remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found) + inertial.place(found)
-    for name, radar in found.radars.items():
-        remarks += tracks.free_fall(found, name, radar)
-    for name, fixes in found.gnss.items():
-        remarks += tracks.receiver_velocity(found, name, fixes)
+    for radar in found.radars.values():
+        remarks += tracks.free_fall(found, radar)
+    for fixes in found.gnss.values():
+        remarks += tracks.receiver_velocity(found, fixes)
     suspicious = {f.source for f in remarks}
     trackers = {name: record for name, record in tracks.tracks(found).items() if name not in suspicious}
     names = list(trackers)
@@ -299,8 +299,8 @@ def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord]
     whole = np.isfinite(position).all(axis=1)
     t, position = record.time_s[whole], position[whole]
     height = earth.geodetic_from_ecef(position, found.spec.body)[2]
-    for name, barometer in found.barometers.items():
-        report.cross_checks += pressure_and_field.barometer_unit(found, name, barometer, t, height)
+    for barometer in found.barometers.values():
+        report.cross_checks += pressure_and_field.barometer_unit(found, barometer, t, height)
     report.cross_checks += pressure_and_field.field_size(found, t, position)
 
 

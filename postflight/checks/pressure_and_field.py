@@ -37,20 +37,12 @@ _MOST_SAMPLES = 4000  # enough for two numbers, and quick on a long flight
 _LARGEST_LAG_S, _COARSE_S = 0.5, 0.025  # of a clock set to half a second; a sixteenth of a turn at 2.5 Hz
 
 
-def barometer_unit(
-    found: Sources, name: str, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray
-) -> list[Finding]:
+def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray) -> list[Finding]:
     """Check a barometer's unit by its changes of height against a track's: ``barometer-unit`` or none.
 
-    Parameters
-    ----------
-    found : Sources
-    name : str
-        Of the barometer in flight.toml.
-    record : BarometerRecord
-    time_s, height_m : (n,) float
-        Of the track, above the ellipsoid.
+    The track has heights above the ellipsoid (n,) at its times (n,).
     """
+    name = record.spec.name
     entry = found.spec.barometers[name]
     if "height" not in entry.columns and "pressure" in entry.columns:
         return []

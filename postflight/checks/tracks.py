@@ -105,21 +105,9 @@ def _hours(start: float, stop: float, low: float, high: float) -> str:
 # units of a radar, by free fall
 
 
-def free_fall(found: Sources, name: str, record: RadarRecord) -> list[Finding]:
-    """Check a radar's units and order of angles by free fall.
-
-    Parameters
-    ----------
-    found : Sources
-    name : str
-        Of the radar in flight.toml.
-    record : RadarRecord
-
-    Returns
-    -------
-    list of Finding
-        ``radar-unit``, ``radar-angles-exchanged``, or none.
-    """
+def free_fall(found: Sources, record: RadarRecord) -> list[Finding]:
+    """Check a radar's units and order of angles by free fall: ``radar-unit``, ``radar-angles-exchanged``, or none."""
+    name = record.spec.name
     declared = tuple(unit_of(found.spec.radars[name], q) for q in tables.RADAR)
     shares = {}
     for units in _candidates(declared):
@@ -194,9 +182,9 @@ def _sharp(force: TrackForce) -> BoolArray:
 # a receiver's velocities
 
 
-def receiver_velocity(found: Sources, name: str, record: GnssRecord) -> list[Finding]:
+def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
     """Check a receiver's velocities against displacements: ``gnss-velocity-sign``, ``gnss-velocity-unit`` or none."""
-    t, p, v = record.time_s, record.position_ecef_m, record.velocity_ecef_mps
+    name, t, p, v = record.spec.name, record.time_s, record.position_ecef_m, record.velocity_ecef_mps
     whole = np.isfinite(p).all(axis=1) & np.isfinite(v).all(axis=1)
     t, p, v = t[whole], p[whole], v[whole]
     if len(t) < 20:

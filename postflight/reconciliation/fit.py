@@ -313,13 +313,7 @@ def reconcile(
     loaded : bool
         Only where air loads the joint (`select_measurements`).
     progress : callable, optional
-
-    Raises
-    ------
-    GateError
-        Where sensors or vehicle are missing, or there is no pressure pulse.
-    DivergenceError
-        Where the vehicle file's joint diverges.
+        It raises as `postflight.reconciliation.command.reconcile`.
     """
     problem = problem_of(flight, select_measurements(flight, loaded), laws)
     report = progress or (lambda _fraction, _what: None)
