@@ -48,8 +48,9 @@ def everything(folder, side_by_side):
     from postflight import warmup
     from recon.reconstruct import reconstruct
     from synthetic_flight import simulate
-    from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+    from synthetic_flight.ensemble import Start, fly_ensemble
     from synthetic_flight.scenarios import child_rng, fly_scenario, initial_state, read_scenario
+    from synthetic_flight.simulate import Schedule
     from synthetic_flight.weather import day_of_flight_atmosphere
 
     scenario = read_scenario("irve2_reference")

@@ -18,9 +18,9 @@ from problem import reference_problem
 
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import simulate
-from synthetic_flight.ensemble import LANES, Schedule, Start, available_cores, fly_ensemble
+from synthetic_flight.ensemble import LANES, Start, available_cores, fly_ensemble
 from synthetic_flight.scenarios import child_rng, read_scenario
-from synthetic_flight.simulate import integrate
+from synthetic_flight.simulate import Schedule, integrate
 from synthetic_flight.weather import AUGUST, day_of_flight_atmosphere
 
 SECONDS, RECORD_HZ = 300.0, 10.0

@@ -49,8 +49,8 @@ def _simulator() -> None:
 
 
 def _fly_ensemble(creep: int) -> None:
-    from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
-    from synthetic_flight.simulate import parameter_vector, vacuum_table
+    from synthetic_flight.ensemble import Start, fly_ensemble
+    from synthetic_flight.simulate import Schedule, parameter_vector, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     start = Start(np.append(state, np.zeros(creep)), parameter_vector(vehicle), vacuum_table())

@@ -32,7 +32,7 @@ from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
 from synthetic_flight.dynamics import check_step
 from synthetic_flight.scenarios import Scenario, TimeSpan, initial_state
-from synthetic_flight.simulate import integrate_lanes
+from synthetic_flight.simulate import Schedule, integrate_lanes
 
 # two to four vectors of a register each; more lanes outgrow the first-level cache
 LANES = 16
@@ -69,16 +69,6 @@ class Flown:
     states: FloatArray
     aux: FloatArray
     diverged: bool
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """Steps and records that all flights of an ensemble share: ``records`` of them, ``per_record`` steps apart."""
-
-    step_s: float
-    per_record: int
-    records: int
-    lock_records: int = 0
 
 
 def available_cores() -> int:
@@ -139,10 +129,7 @@ def _fly_block(vehicle: Vehicle, runs: list[int], starts: list[Start], schedule:
         starts[0].atmosphere if shared else np.stack([s.atmosphere for s in padded]),
         np.stack([simulate.with_creep(s.state, vehicle) for s in padded]),
         np.stack([s.parameters for s in padded]),
-        schedule.step_s,
-        schedule.per_record,
-        schedule.records,
-        schedule.lock_records,
+        schedule,
     )
     return [Flown(run, *lane) for run, lane in zip(runs, lanes, strict=False)]
 

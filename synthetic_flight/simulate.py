@@ -166,6 +166,16 @@ def _phase_rows(vehicle: Vehicle, time_s: FloatArray) -> list[tuple[slice, Vehic
     return [(slice(a, b), flown) for a, b, (_, _, flown) in zip(edges, ends, phases, strict=True) if b > a]
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """Steps and records that flights side by side share: ``records`` of them, ``per_record`` steps apart."""
+
+    step_s: float
+    per_record: int
+    records: int
+    lock_records: int = 0
+
+
 def state_from_ecef(
     time_s: float,
     position_ecef_m: FloatArray,
@@ -211,10 +221,8 @@ def integrate(
             code="integration-arguments",
         )
     parameters = parameter_vector(vehicle)[None]
-    lanes = integrate_lanes(
-        vehicle, atmosphere, state[None], parameters, step_s, per_record, records, lock_records, planet
-    )
-    return lanes[0][:2]
+    schedule = Schedule(step_s, per_record, records, lock_records)
+    return integrate_lanes(vehicle, atmosphere, state[None], parameters, schedule, planet)[0][:2]
 
 
 def integrate_lanes(
@@ -222,23 +230,17 @@ def integrate_lanes(
     atmosphere: FloatArray,
     states: FloatArray,
     parameters: FloatArray,
-    step_s: float,
-    per_record: int,
-    records: int,
-    lock_records: int,
+    schedule: Schedule,
     planet: earth.Planet = earth.WGS84,
-    air_from_m: float = ATMOSPHERE_START_M,
 ) -> list[tuple[FloatArray, FloatArray, bool]]:
     """States, auxiliaries and whether the joint diverged of flights side by side.
 
     ``states`` ``(lanes, 20)``, or ``(lanes, 22)`` of joints that creep, ``parameters`` ``(lanes, 79)``; ``atmosphere``
-    is one table, or ``(lanes, rows, 6)``, its first row at ``air_from_m``.
+    is one table, or ``(lanes, rows, 6)``.
     """
     lanes, width = states.shape
-    out, aux = np.empty((lanes, records, width)), np.empty((lanes, records, AUX))
-    written = integrate_into(
-        out, aux, vehicle, atmosphere, states, parameters, step_s, per_record, lock_records, planet, air_from_m
-    )
+    out, aux = np.empty((lanes, schedule.records, width)), np.empty((lanes, schedule.records, AUX))
+    written = integrate_into(out, aux, vehicle, atmosphere, states, parameters, schedule, planet)
     counts = np.abs(written)
     return [(*_finite_records(out[k, :n], aux[k, :n]), bool(written[k] < 0)) for k, n in enumerate(counts.tolist())]
 
@@ -250,32 +252,32 @@ def integrate_into(
     atmosphere: FloatArray,
     states: FloatArray,
     parameters: FloatArray,
-    step_s: float,
-    per_record: int,
-    lock_records: int = 0,
+    schedule: Schedule,
     planet: earth.Planet = earth.WGS84,
     air_from_m: float = ATMOSPHERE_START_M,
 ) -> NDArray[np.int64]:
     """`integrate_lanes` into ``out`` (lanes, records, 20 or 22) and ``aux`` (lanes, records, 18).
+
+    The first row of the atmosphere's table is at ``air_from_m``.
 
     Returns
     -------
     (lanes,) int
         Records that are written, negative where the joint diverged; what follows them is left as it was.
     """
-    lanes, records, width = out.shape
+    lanes, _, width = out.shape
     written = np.zeros(lanes, dtype=np.int64)
     at.integrate(
         (0,) * lanes,
         (0,) * (width - STATES),
         (0,) * int(parameters[:, at.TERMS :].any()),
-        workspace(states, parameters, step_s),
+        workspace(states, parameters, schedule.step_s),
         kernel_tables(vehicle, atmosphere, air_from_m),
         planet,
-        step_s,
-        per_record,
-        records,
-        lock_records,
+        schedule.step_s,
+        schedule.per_record,
+        schedule.records,
+        schedule.lock_records,
         DEFLECTION_LIMIT_RAD,
         out,
         aux,

@@ -649,7 +649,7 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
         states, aux = (np.full((LANES, steps.records, n), np.nan) for n in (starts.shape[1], simulate.AUX))
         simulate.integrate_into(
             states, aux, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
-            steps.step_s, steps.per_record,
+            simulate.Schedule(steps.step_s, steps.per_record, steps.records),
             air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
         )  # fmt: skip
         states, aux = _until_lost(states[: block.stop - begin], aux[: block.stop - begin])

@@ -42,8 +42,8 @@ from synthetic_flight.dispersions import (
     rng_from_draw,
 )
 from synthetic_flight.dynamics import check_step
-from synthetic_flight.ensemble import LANES, Flown, Records, Schedule, Start, fly_legs
-from synthetic_flight.simulate import state_from_ecef
+from synthetic_flight.ensemble import LANES, Flown, Records, Start, fly_legs
+from synthetic_flight.simulate import Schedule, state_from_ecef
 from synthetic_flight.weather import correlated
 
 START_ALTITUDE_M = 100e3

@@ -9,8 +9,8 @@ from pydantic import ValidationError
 from flightmodel import rotations
 from flightmodel.vehicle import AeroTerms, CompliantJoint
 from synthetic_flight import simulate
-from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
-from synthetic_flight.simulate import integrate
+from synthetic_flight.ensemble import Start, fly_ensemble
+from synthetic_flight.simulate import Schedule, integrate
 from tests.oracles import two_body
 
 from .conftest import bent_entry_state

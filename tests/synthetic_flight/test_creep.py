@@ -17,9 +17,9 @@ from flightmodel.checks import ConfigError
 from flightmodel.vehicle import CompliantJoint
 from synthetic_flight import _kernels, dynamics, simulate
 from synthetic_flight import _kernels as at
-from synthetic_flight.ensemble import Schedule, Start, fly_ensemble
+from synthetic_flight.ensemble import Start, fly_ensemble
 from synthetic_flight.linear import Slopes, linear_matrix, modes, static_trim
-from synthetic_flight.simulate import integrate
+from synthetic_flight.simulate import Schedule, integrate
 from tests.oracles import two_body
 
 from .conftest import bent_entry_state, free_state, undamped, with_joint

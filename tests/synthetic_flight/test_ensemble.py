@@ -11,9 +11,9 @@ from flightmodel import earth
 from flightmodel._kernels import FASTMATH
 from flightmodel.checks import ConfigError
 from synthetic_flight import _kernels, simulate
-from synthetic_flight.ensemble import LANES, Schedule, Start, fly_ensemble
+from synthetic_flight.ensemble import LANES, Start, fly_ensemble
 from synthetic_flight.scenarios import child_rng
-from synthetic_flight.simulate import integrate
+from synthetic_flight.simulate import Schedule, integrate
 from synthetic_flight.weather import AUGUST, DayOfFlightAtmosphere, day_of_flight_atmosphere
 
 from .conftest import entry_state

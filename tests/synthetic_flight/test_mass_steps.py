@@ -9,8 +9,8 @@ from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.vehicle import MassStep
-from synthetic_flight.ensemble import Schedule, fly_legs
-from synthetic_flight.simulate import fly
+from synthetic_flight.ensemble import fly_legs
+from synthetic_flight.simulate import Schedule, fly
 from tests.refusing import refuses
 
 from .conftest import bent_entry_state
