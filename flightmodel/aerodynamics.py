@@ -42,7 +42,17 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
-from flightmodel.config import FileBeside, Fraction, KeyFaults, Length, Place, Section, parse_section, read_toml
+from flightmodel.config import (
+    FileBeside,
+    Fraction,
+    KeyFaults,
+    Length,
+    Place,
+    Section,
+    check_one_of,
+    parse_section,
+    read_toml,
+)
 from flightmodel.files import file_bytes
 from flightmodel.sphere_cone import (
     bridge,
@@ -590,8 +600,7 @@ class Aerodynamics(Section):
 
     @model_validator(mode="after")
     def _one(self) -> Aerodynamics:
-        if (self.table is None) == (self.sphere_cone is None):
-            raise ValueError("either table or sphere_cone is wanted, and not both")
+        check_one_of(self, "table", "sphere_cone")
         return self
 
 

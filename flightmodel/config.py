@@ -214,3 +214,9 @@ def parse_utc(text: str) -> datetime:
     if not YEARS[0] <= stamp.year <= YEARS[1]:
         raise ValueError(f"a year from {YEARS[0]} to {YEARS[1]} is wanted")
     return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)
+
+
+def check_one_of(section: Section, first: str, second: str) -> None:
+    """Raise `ValueError` where a section states neither of two keys, or both."""
+    if (getattr(section, first) is None) == (getattr(section, second) is None):
+        raise ValueError(f"either {first} or {second} is wanted, and not both")

@@ -6,7 +6,7 @@ Reading and writing of flight folders: `flightmodel.flightfolder`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -31,19 +31,15 @@ class SensorRecord:
         Strictly increasing, seconds after t0.
     """
 
+    SHAPES: ClassVar[dict[str, tuple[int | None, ...]]] = {}  # of what is read at one time, by field
     spec: InstrumentSpec
     time_s: FloatArray
 
     def __post_init__(self) -> None:
         """Check once."""
         check_increasing(self.spec.name, self.time_s)
-        for name, shape in self.shapes.items():
+        for name, shape in self.SHAPES.items():
             check_shape(self.spec.name, getattr(self, name), (len(self.time_s), *shape))
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -57,13 +53,9 @@ class TriadRecord(SensorRecord):
         is missing.
     """
 
+    SHAPES = {"measured_sensor": (3,)}
     spec: TriadSpec
     measured_sensor: FloatArray
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        return {"measured_sensor": (3,)}
 
 
 @dataclass(frozen=True)
@@ -80,10 +72,10 @@ class SunRecord(SensorRecord):
     spec: SunHeads
     az_el_head_rad: FloatArray
 
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        return {"az_el_head_rad": (len(self.spec.clock_lv_rad), 2)}
+    def __post_init__(self) -> None:
+        """Check once, the number of heads too."""
+        super().__post_init__()
+        check_shape(self.spec.name, self.az_el_head_rad, (len(self.time_s), len(self.spec.clock_lv_rad), 2))
 
 
 @dataclass(frozen=True)
@@ -103,17 +95,13 @@ class RadarRecord(SensorRecord):
         Noise of each range, azimuth, elevation, range rate; NaN, or None, where the site's holds.
     """
 
+    SHAPES = {"range_az_el": (3,)}
     spec: RadarSite
     range_az_el: FloatArray
     point: str = "cg"
     every_s: tuple[ThinnedSpan, ...] = ()
     range_rate_mps: FloatArray | None = None
     sd: FloatArray | None = None
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        return {"range_az_el": (3,)}
 
 
 @dataclass(frozen=True)
@@ -133,16 +121,12 @@ class GnssRecord(SensorRecord):
         m; of each horizontal axis of the velocity and of the vertical one, m/s.
     """
 
+    SHAPES = {"position_ecef_m": (3,), "velocity_ecef_mps": (3,)}
     spec: GnssSpec
     position_ecef_m: FloatArray
     velocity_ecef_mps: FloatArray
     every_s: tuple[ThinnedSpan, ...] = ()
     sd: FloatArray | None = None
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        return {"position_ecef_m": (3,), "velocity_ecef_mps": (3,)}
 
     @property
     def has_positions(self) -> bool:
@@ -162,14 +146,10 @@ class BarometerRecord(SensorRecord):
         Of heights closer than this some are predicted, not used.
     """
 
+    SHAPES = {"height_m": ()}
     spec: BarometerSpec
     height_m: FloatArray
     every_s: tuple[ThinnedSpan, ...] = ()
-
-    @property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of what is read at one time, by field."""
-        return {"height_m": ()}
 
 
 @dataclass(frozen=True)

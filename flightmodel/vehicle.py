@@ -28,6 +28,7 @@ from flightmodel.config import (
     Place,
     Section,
     Time,
+    check_one_of,
     parse_section,
     read_toml,
 )
@@ -109,8 +110,7 @@ class MassStep(Section):
 
     @model_validator(mode="after")
     def _whole(self) -> MassStep:
-        if (self.from_s is None) == (self.event is None):
-            raise ValueError("either from_s or event is wanted, and not both")
+        check_one_of(self, "from_s", "event")
         if self.aeroshell is None and self.centerbody is None:
             raise ValueError("the body that changes is wanted: aeroshell, centerbody or both")
         return self

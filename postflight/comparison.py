@@ -32,15 +32,6 @@ Sd = TypeVar("Sd", float, pd.Series)
 MOST_RUNS = 6  # that strokes and colours keep apart
 INDEPENDENT, CORRELATED = "independent", "correlated"
 # quantity, its unit, its column in bet.csv and that of its sd
-TRAJECTORY = (
-    ("dynamic pressure", "Pa", "dynamic_pressure_pa"),
-    ("Mach number", "", "mach"),
-    ("total angle of attack", "deg", "alpha_total_wind_deg"),
-    ("altitude", "m", "alt_m"),
-    ("airspeed", "m/s", "airspeed_mps"),
-    ("C_A", "", "c_a"),
-    ("C_N", "", "c_n"),
-)
 _APART = (("position_m", slice(0, 3), 1.0), ("velocity_mps", slice(3, 6), 1.0), ("attitude_deg", slice(6, 9), None))
 
 
@@ -51,6 +42,17 @@ class Quantity:
     words: str
     unit: str
     column: str
+
+
+TRAJECTORY = (
+    Quantity("dynamic pressure", "Pa", "dynamic_pressure_pa"),
+    Quantity("Mach number", "", "mach"),
+    Quantity("total angle of attack", "deg", "alpha_total_wind_deg"),
+    Quantity("altitude", "m", "alt_m"),
+    Quantity("airspeed", "m/s", "airspeed_mps"),
+    Quantity("C_A", "", "c_a"),
+    Quantity("C_N", "", "c_n"),
+)
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,7 @@ class RunComparison(Tabular):
         methods = [m for m in METHODS if any(run.history(m) is not None for run in self.runs)]
         found = [Quantity(f"deflection: {m}", "deg", f"deflection_{m}_deg") for m in methods]
         found += [Quantity(f"largest: {m}", "deg", f"largest_{m}_deg") for m in methods]
-        found += [Quantity("time of peak q", "s", "peak_s")]
-        found += [Quantity(words, unit, column) for words, unit, column in TRAJECTORY]
+        found += [Quantity("time of peak q", "s", "peak_s"), *TRAJECTORY]
         return tuple(q for q in found if any(np.isfinite(own.get(q.column, (np.nan,))[0]) for own in self.values))
 
     @cached_property
@@ -213,9 +214,9 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
     bet, nothing = run.tables["bet"], (float("nan"), float("nan"))
     out = {"peak_s": (run.peak_s, np.nan)}
     inside = bet["t_s"].iloc[0] <= at_s <= bet["t_s"].iloc[-1]
-    for _, _, column in TRAJECTORY:
-        known = inside and bet[column].notna().any()
-        out[column] = _near(bet, column, at_s) if known else nothing
+    for q in TRAJECTORY:
+        known = inside and bet[q.column].notna().any()
+        out[q.column] = _near(bet, q.column, at_s) if known else nothing
     loaded = bet["t_s"][pressure_pulse(np.nan_to_num(bet["dynamic_pressure_pa"].to_numpy(dtype=float)))]
     for method in METHODS:
         history = run.history(method)
@@ -255,8 +256,8 @@ def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
         raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "no-common-time")
     t = a["t_s"][rows].to_numpy(float)
     out = {"t_s": t, "run": ""} | _vectors(a[rows], b)
-    for _, _, column in TRAJECTORY:
-        out[column] = np.interp(t, b["t_s"], b[column]) - a[column][rows].to_numpy(float)
+    for q in TRAJECTORY:
+        out[q.column] = np.interp(t, b["t_s"], b[q.column]) - a[q.column][rows].to_numpy(float)
     for method in METHODS:
         both = [history for run in (first, other) if (history := run.history(method)) is not None]
         if len(both) == 2:

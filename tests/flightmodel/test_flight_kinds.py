@@ -353,21 +353,6 @@ def test_ballistic_without_drag_is_refused(folder):
     )
 
 
-@pytest.mark.parametrize(
-    ("axes", "code", "name"),
-    [
-        ('["+x", "+y", "-z"]', "axes-left-handed", "axes"),
-        ('["+x", "+x", "+z"]', "axes-parallel", "axes"),
-        ('["+x", "-x", "+z"]', "axes-parallel", "axes"),
-        ('["x", "+y", "+z"]', "key-value", "axes.0"),
-    ],
-)
-def test_axes_that_are_none_are_refused(folder, axes, code, name):
-    folder.refused(
-        [GNSS, PRIOR, TRIADS.replace('mount = "body"', f"axes = {axes}")], code, "sensors.accelerometer.axes", name
-    )
-
-
 def test_mounts_that_contradict_or_lack_a_vehicle_are_refused(folder):
     folder.refused(
         [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "body"\naxes = ["+x", "+y", "+z"]')], "keys-conflict"
@@ -442,25 +427,43 @@ def test_prior_must_have_one_form(folder):
     folder.refused([GNSS, TRIADS, PRIOR + "sd_deg = 0\n"], "key-value", "attitude_prior.sd_deg")
 
 
+def with_axes(axes):
+    return [GNSS, PRIOR, TRIADS.replace('mount = "body"', f"axes = {axes}")]
+
+
 @pytest.mark.parametrize(
-    ("line", "code", "name"),
+    ("sections", "code", "names", "kind"),
     [
-        ("use_s = [[5.0, 5.0]]", "key-value", "use_s"),
-        ("use_s = []", "key-value", "use_s"),
-        ("use_s = [[100.0, 200.0]]", "use-span-empty", "0 rows"),
-        ("min_satelites = 6", "key-unknown", "'min_satellites'"),
-        ("horizontal_sd_m = 0.0", "key-value", "gnss.gps.horizontal_sd_m"),
-        ("time_bias_sd_s = 100.0", "key-value", "gnss.gps.time_bias_sd_s"),
-        ("antenna_from_datum_body_m = [0.0, 0.0, 1000.0]", "key-value", "antenna_from_datum_body_m"),
-        ('time = { format = "utc_hms" }', "keys-conflict", "time"),
-        ('time = { repeats = "last" }', "key-value", "repeats"),
-        ("geoid_undulation_m = 500.0", "key-value", "geoid_undulation_m"),
-        ("velocity = 1", "key-value", "velocity"),
-        ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "quantity-unknown", "'lat'"),
+        *(
+            (with_axes(axes), code, ("sensors.accelerometer.axes", name), ConfigError)
+            for axes, code, name in (
+                ('["+x", "+y", "-z"]', "axes-left-handed", "axes"),
+                ('["+x", "+x", "+z"]', "axes-parallel", "axes"),
+                ('["+x", "-x", "+z"]', "axes-parallel", "axes"),
+                ('["x", "+y", "+z"]', "key-value", "axes.0"),
+            )
+        ),
+        *(
+            ([GNSS + line, BALLISTIC], code, (name,), GateError)
+            for line, code, name in (
+                ("use_s = [[5.0, 5.0]]", "key-value", "use_s"),
+                ("use_s = []", "key-value", "use_s"),
+                ("use_s = [[100.0, 200.0]]", "use-span-empty", "0 rows"),
+                ("min_satelites = 6", "key-unknown", "'min_satellites'"),
+                ("horizontal_sd_m = 0.0", "key-value", "gnss.gps.horizontal_sd_m"),
+                ("time_bias_sd_s = 100.0", "key-value", "gnss.gps.time_bias_sd_s"),
+                ("antenna_from_datum_body_m = [0.0, 0.0, 1000.0]", "key-value", "antenna_from_datum_body_m"),
+                ('time = { format = "utc_hms" }', "keys-conflict", "time"),
+                ('time = { repeats = "last" }', "key-value", "repeats"),
+                ("geoid_undulation_m = 500.0", "key-value", "geoid_undulation_m"),
+                ("velocity = 1", "key-value", "velocity"),
+                ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "quantity-unknown", "'lat'"),
+            )
+        ),
     ],
 )
-def test_slips_of_the_pen_are_refused(folder, line, code, name):
-    folder.refused([GNSS + line, BALLISTIC], code, name, kind=GateError)
+def test_slips_of_the_pen_are_refused(folder, sections, code, names, kind):
+    folder.refused(sections, code, *names, kind=kind)
 
 
 def test_a_name_stands_once_and_a_sounding_has_no_spans(folder):
