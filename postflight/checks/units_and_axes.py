@@ -15,9 +15,8 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from flightmodel.checks import FloatArray
-from flightmodel.tables import Quantity, Source, place
+from flightmodel.tables import UNITS, Quantity, Source, place, read_unit
 from flightmodel.telemetry import Finding
-from flightmodel.units import UNITS, read_unit
 
 Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))

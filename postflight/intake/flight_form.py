@@ -26,8 +26,7 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
 from flightmodel.files import write_file
 from flightmodel.flightfolder import FlightFile
-from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES
-from flightmodel.units import UNITS
+from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
 from flightmodel.vehicle import DATA, VehicleFile, vehicle_from_toml, vehicle_path
 from postflight.intake.column_recognition import (
     ASKED,

@@ -3,7 +3,7 @@
 import pint
 import pytest
 
-from flightmodel.units import UNITS, read_unit
+from flightmodel.tables import UNITS, read_unit
 
 PINT = pint.UnitRegistry()
 IN_PINT = {
