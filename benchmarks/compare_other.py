@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import earth, rotations
+from flightmodel.earth import undulation_m
 from flightmodel.flightfolder import read_flight
-from flightmodel.geoid import undulation_m
 from flightmodel.thinning import ThinnedSpan
 from postflight.intake.other_trajectory import OtherTrajectory
 from postflight.systematic_differences import systematic_differences

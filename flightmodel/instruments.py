@@ -26,7 +26,7 @@ from pydantic import AfterValidator, BaseModel, Field, create_model, model_valid
 
 from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 from flightmodel.tables import Declared, Source
 from flightmodel.thinning import Thinning
 

@@ -42,8 +42,8 @@ from rich import markup
 from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.config import parse_utc
+from flightmodel.earth import undulation_m
 from flightmodel.files import file_bytes, open_file, write_file, writing
-from flightmodel.geoid import undulation_m
 from postflight.run_folder import DIGITS, read_csv
 from postflight.runs import find_run
 from postflight.terminal import terminal

@@ -62,7 +62,7 @@ from scipy.special import logsumexp
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample

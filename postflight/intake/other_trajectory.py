@@ -26,8 +26,8 @@ import numpy as np
 from flightmodel import earth, rotations, tables
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
+from flightmodel.earth import undulation_m
 from flightmodel.files import UnfitFile, file_bytes
-from flightmodel.geoid import undulation_m
 from postflight.intake.column_recognition import Recogniser, SourceProposal
 from postflight.intake.freeform_tables import LEAST_ROWS, FreeFormTable
 from postflight.intake.stored_tables import read_tables

@@ -10,9 +10,8 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import height_from_pressure, profile_from_sounding, standard_sounding, us76
 from flightmodel.checks import ConfigError, GateError
-from flightmodel.earth import q_ecef_body_from_pointing
+from flightmodel.earth import q_ecef_body_from_pointing, undulation_m
 from flightmodel.flightfolder import read_flight
-from flightmodel.geoid import undulation_m
 from tests.refusing import numbers_in, refuses
 
 DEG = np.pi / 180.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 
 # latitude, longitude east (deg) and undulation (m): INPUT.DAT and OUTINTPT.DAT, which accompany WW15MGH.GRD
 PUBLISHED = np.array(

@@ -11,7 +11,7 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.airdata import Inputs, _path_angles, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 from postflight import exports, run_folder
 from postflight.cli import cli
 from postflight.deflections import Deflections

@@ -14,7 +14,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.checks import GateError
-from flightmodel.geoid import undulation_m
+from flightmodel.earth import undulation_m
 from flightmodel.trajectory import resample
 from postflight import exports
 from postflight import systematic_differences as differences
