@@ -25,7 +25,7 @@ import numpy as np
 from flightmodel import earth, rotations
 from flightmodel.earth import undulation_m
 from flightmodel.flightfolder import read_flight
-from flightmodel.thinning import ThinnedSpan
+from flightmodel.tables import ThinnedSpan
 from postflight.intake.other_trajectory import OtherTrajectory
 from postflight.systematic_differences import systematic_differences
 from recon.reconstruct import reconstruct

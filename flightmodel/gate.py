@@ -32,9 +32,8 @@ import pandas as pd
 from flightmodel import tables
 from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
-from flightmodel.tables import Source
+from flightmodel.tables import Source, ThinnedSpan, spaced, spacing_s
 from flightmodel.telemetry import Finding
-from flightmodel.thinning import ThinnedSpan, spaced, spacing_s
 
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
 SANE_LIMIT = {

@@ -27,8 +27,7 @@ from pydantic import AfterValidator, BaseModel, Field, create_model, model_valid
 from flightmodel.checks import Fault, FloatArray
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
 from flightmodel.earth import undulation_m
-from flightmodel.tables import Declared, Source
-from flightmodel.thinning import Thinning
+from flightmodel.tables import Declared, Source, Thinning
 
 
 def _none_or_some(hertz: float) -> float:
@@ -641,7 +640,7 @@ class SunEntry(Source):
 
 
 class TrackingSource(Source):
-    """A table of places; of rows closer than ``every_s`` (`flightmodel.thinning`) some are predicted, not used.
+    """A table of places; of rows closer than ``every_s`` (`flightmodel.tables`) some are predicted, not used.
 
     Errors that last several rows are no white noise: taken for it, a hundred rows of one error count as a hundred.
     """

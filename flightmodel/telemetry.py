@@ -13,7 +13,7 @@ import numpy as np
 from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
 from flightmodel.earth import WGS84, Planet
 from flightmodel.instruments import BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
-from flightmodel.thinning import ThinnedSpan
+from flightmodel.tables import ThinnedSpan
 from flightmodel.vehicle import Vehicle
 
 if TYPE_CHECKING:

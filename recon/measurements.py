@@ -42,8 +42,8 @@ import numpy as np
 from flightmodel import earth, instruments, rotations
 from flightmodel.checks import FloatArray, IntArray
 from flightmodel.earth import WGS84, Planet
+from flightmodel.tables import spacing_s
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
-from flightmodel.thinning import spacing_s
 from recon import _measurement_kernels
 from recon._measurement_kernels import (
     DECELERATION,

@@ -23,8 +23,8 @@ from flightmodel.earth import Planet
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
+from flightmodel.tables import spaced
 from flightmodel.telemetry import AttitudePrior, Start, StatePrior, Telemetry
-from flightmodel.thinning import spaced
 from flightmodel.trajectory import nearest_index
 from recon import measurements
 from recon._measurement_kernels import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY

@@ -10,7 +10,7 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.gate import oversampled
 from flightmodel.instruments import GnssEntry, RadarEntry
-from flightmodel.thinning import ThinnedSpan, spaced, spacing_s
+from flightmodel.tables import ThinnedSpan, spaced, spacing_s
 from recon.measurements import radar_instrument
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
