@@ -3,7 +3,7 @@
 `EditedFrame` is a picture with the decisions about it (`flightmodel.camera_edits`); the fit looks for edge and features
 through it alone:
 
-- inside a mask, and where text is burnt into the film (`flightmodel.burnt_in`), nothing is found;
+- inside a mask, and where text is burnt into the film (`flightmodel.film`), nothing is found;
 - points of the edge marked by hand take the place of the edge found in that frame;
 - features marked by hand in the benchmark frame become points of the shell where their rays meet it
   (`marked_on_shell`), and where they are marked in another frame count two rows each, along the picture's rows and

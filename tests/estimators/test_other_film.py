@@ -26,10 +26,10 @@ from estimators.features import no_features
 from estimators.frame_edits import EditedFrame
 from estimators.frame_solution import FrameFit, NoFitError, refused_fit
 from estimators.virtual_camera import deformation_of
-from flightmodel.burnt_in import burnt_in
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
 from flightmodel.checks import NO_FAULT, Fault
+from flightmodel.film import burnt_in
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame, text_in_films
 from postflight.filming import joint_swing

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flightmodel.burnt_in import burnt_in
-from flightmodel.film import Frames
+from flightmodel.film import Frames, burnt_in
 
 TEXT_AT, HEIGHT, WIDTH = (200, 150), 240, 480
 
