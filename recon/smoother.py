@@ -42,7 +42,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray, IntArray
-from recon import _smoother_kernels
+from recon import _filter_kernels
 from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps
 from recon.settings import COMPILED
 from recon.state import KINEMATIC, States, boxplus, packed, unpacked
@@ -92,7 +92,7 @@ def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True, eng
 
 def backward(engine: str) -> Callable[..., None]:
     """Rauch-Tung-Striebel's pass of an engine: arguments as `rauch_tung_striebel`."""
-    return _smoother_kernels.rauch_tung_striebel if engine == COMPILED else rauch_tung_striebel
+    return _filter_kernels.rauch_tung_striebel if engine == COMPILED else rauch_tung_striebel
 
 
 def step_gain(
