@@ -19,8 +19,7 @@ import numba
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
 
-from flightmodel._compiler_kernels import PartCompiler
-from flightmodel.cache_folder import CacheFolder, cache_folder
+from flightmodel._compiler_kernels import CacheFolder, PartCompiler, cache_folder
 
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
