@@ -62,7 +62,6 @@ from flightmodel.instruments import (
     SunEntry,
     TriadEntry,
 )
-from flightmodel.rest import find_rest, readings
 from flightmodel.sensor_tables import (
     read_barometer,
     read_frames,
@@ -89,6 +88,8 @@ from flightmodel.telemetry import (
     Telemetry,
     TriadRecord,
     UnmodelledSpan,
+    find_rest,
+    mean_readings,
 )
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 
@@ -638,14 +639,14 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
     span = find_rest(telemetry.accelerometer, telemetry.rates)
     if span is None:
         return []
-    noise = [readings(record, span).noise_sd for record in (telemetry.accelerometer, telemetry.rates)]
+    noise = [mean_readings(record, span).noise_sd for record in (telemetry.accelerometer, telemetry.rates)]
     words = (
         f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
         f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     )
     out = [Finding("start", words, *span, code="rest-found")]
     rates = telemetry.rates
-    turning = float(np.abs(readings(rates, span).mean).max()) - telemetry.planet.rate_radps
+    turning = float(np.abs(mean_readings(rates, span).mean).max()) - telemetry.planet.rate_radps
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
         words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"

@@ -27,8 +27,7 @@ from scipy.special import ndtri
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.rest import RestReadings, readings
-from flightmodel.telemetry import AttitudePrior, Finding, Telemetry, TriadRecord
+from flightmodel.telemetry import AttitudePrior, Finding, RestReadings, Telemetry, TriadRecord, mean_readings
 from recon._measurement_kernels import FIELD, VELOCITY
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.measurements import REST, Instrument, instrument_of
@@ -59,7 +58,7 @@ def rest_instruments(telemetry: Telemetry, start_s: float, point_ecef_m: FloatAr
         REST, VELOCITY, REST, np.zeros(3), np.zeros(3), earth.dcm_ned_ecef(float(latitude), float(longitude)),
         times, np.zeros((len(times), 3)), np.full(3, telemetry.start.sd_mps),
     )  # fmt: skip
-    spec, mean = telemetry.rates.spec, readings(telemetry.rates, span)
+    spec, mean = telemetry.rates.spec, mean_readings(telemetry.rates, span)
     if mean.count < 2:
         return (still,)
     walked = 2.0 * spec.bias_wander_sd**2 / spec.bias_time_constant_s * (span[1] - span[0]) / 3.0
@@ -88,7 +87,7 @@ def levelled_attitude(telemetry: Telemetry, start_s: float, point_ecef_m: FloatA
     span = telemetry.start.at_rest
     assert span is not None
     force, _ = telemetry.required_triads()
-    f = force.spec.dcm_body_sensor @ readings(force, span).mean
+    f = force.spec.dcm_body_sensor @ mean_readings(force, span).mean
     up = f / np.linalg.norm(f)
     latitude, longitude, _ = (float(x) for x in earth.geodetic_from_ecef(point_ecef_m))
     ned = earth.dcm_ned_ecef(latitude, longitude)
@@ -133,13 +132,13 @@ def _heading(
         spec = record.spec
         size = np.linalg.norm(field)
         error = np.hypot(spec.bias_sd, size * max(spec.scale_sd, spec.soft_iron_sd))
-        seen = spec.dcm_body_sensor @ readings(record, span).mean
+        seen = spec.dcm_body_sensor @ mean_readings(record, span).mean
         if np.isfinite(seen).all():
             return seen, field, float(error / np.linalg.norm(field[:2]))
     rates = telemetry.required_triads()[1]
     turning = dcm_ned_ecef @ earth.OMEGA_ECEF_RADPS
-    seen = rates.spec.dcm_body_sensor @ readings(rates, span).mean
-    error = np.sqrt(rates.spec.bias_sd**2 + _mean_var(rates, readings(rates, span)))
+    seen = rates.spec.dcm_body_sensor @ mean_readings(rates, span).mean
+    error = np.sqrt(rates.spec.bias_sd**2 + _mean_var(rates, mean_readings(rates, span)))
     return seen, turning, float(_AGAIN * error / np.linalg.norm(turning[:2]))
 
 
@@ -152,7 +151,7 @@ def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArra
     most = float(-ndtri(0.5 * (1.0 - confidence)))
     out = []
     gravity = float(np.linalg.norm(gravity_ecef_mps2(point_ecef_m)))
-    force, mean = telemetry.accelerometer, readings(telemetry.accelerometer, span)
+    force, mean = telemetry.accelerometer, mean_readings(telemetry.accelerometer, span)
     if mean.count > 1:
         s, size = force.spec, float(np.linalg.norm(mean.mean))
         sd = np.sqrt(s.bias_sd**2 + s.bias_wander_sd**2 + (gravity * s.scale_sd) ** 2 + _mean_var(force, mean))
@@ -164,7 +163,7 @@ def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArra
                 advice="scale factor or bias exceed the data sheet: check units and calibration",
             )
         )  # fmt: skip
-    rates, turn = telemetry.rates, readings(telemetry.rates, span)
+    rates, turn = telemetry.rates, mean_readings(telemetry.rates, span)
     if turn.count > 1:
         s = rates.spec
         beyond = np.maximum(np.abs(turn.mean) - earth.OMEGA_RADPS, 0.0)
@@ -188,7 +187,7 @@ def inflated_priors(telemetry: Telemetry, checks: list[ConsistencyCheck], times:
         record = telemetry.accelerometer if check.component != "bias" else telemetry.rates
         assert record is not None
         assert span is not None
-        mean = readings(record, span).mean
+        mean = mean_readings(record, span).mean
         if check.component == "bias":
             out |= {f"{record.spec.name} bias {a}": times * float(np.abs(mean).max()) for a in "xyz"}
             continue
@@ -207,7 +206,7 @@ def noise_findings(telemetry: Telemetry) -> list[Finding]:
     for record, unit, factor in sensors:
         if record is None:
             continue
-        found = readings(record, span).noise_sd
+        found = mean_readings(record, span).noise_sd
         stated = float(np.hypot(record.spec.noise_sd, record.spec.resolution / np.sqrt(12.0)))
         if not 1.0 / _NOISE_FACTOR < found / stated < _NOISE_FACTOR:
             words = f"noise at rest is {factor * found:.3g} {unit}, stated is {factor * stated:.3g}"

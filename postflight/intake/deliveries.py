@@ -37,9 +37,8 @@ from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import read_toml
 from flightmodel.files import file_bytes, write_file, writing
 from flightmodel.instruments import TriadSpec
-from flightmodel.rest import find_rest, readings
 from flightmodel.tables import to_si
-from flightmodel.telemetry import TriadRecord
+from flightmodel.telemetry import TriadRecord, find_rest, mean_readings
 from flightmodel.vehicle import DATA, vehicle_path
 from postflight.intake.column_recognition import (
     ASKED,
@@ -631,7 +630,7 @@ def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]
     span = find_rest(*both)
     if span is None:
         return ""
-    noise = [readings(record, span).noise_sd for record in both]
+    noise = [mean_readings(record, span).noise_sd for record in both]
     words = f"noise there, for the data sheets: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     return f"[start]  # the data begin with a rest\nat_rest = [{span[0]:.2f}, {span[1]:.2f}]  # s; {words}\n"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from flightmodel.rest import find_rest
+from flightmodel.telemetry import find_rest
 from recon.reconstruct import reconstruct, reconstruct_once
 from recon.settings import Settings
 from tests.recon import pad_flight
