@@ -236,9 +236,7 @@ def _cross_check(found: Sources, report: Report) -> None:
             _keep_sharp(report, bias)
     for name, record in trackers.items():
         _against_accelerometer(found, name, record, report)
-    from postflight.checks.oscillation import oscillation_of  # with the filter's package, where there are tables
-
-    swings = oscillation_of(found)
+    swings = inertial.oscillation_of(found)
     remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
     _keep_sharp(report, swings.bias)
     rotation, lag = pressure_and_field.field_rotation(found)

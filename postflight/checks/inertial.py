@@ -12,21 +12,26 @@ wanders by far more than the track allows and exactly another choice brings it t
 detected: a body that hardly rotates is no contradiction where the force hardly does. From the attitude prior the
 carried force has a direction of its own; the prior is suspicious beyond four standard deviations of itself and of the
 gyros' drift since.
+
+Do accelerometer and gyros sense one oscillation, at one time and in one set of axes? (`recon.oscillation`).
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import BoolArray, Fault, FloatArray
+from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import AttitudePrior, Finding, TriadRecord
 from postflight.checks.track_force import Comparison, TrackForce
 from postflight.checks.units_and_axes import (
     AS_DECLARED,
     Axes,
+    TimeBias,
     all_axes,
     axes_matrix,
     axes_named,
@@ -342,3 +347,33 @@ def _wander(sums: FloatArray, track_mps2: FloatArray) -> FloatArray:
         angle = np.arccos(np.clip(np.einsum("ki,ki->k", track, seen @ best.T), -1.0, 1.0))
         out[c] = float(np.sqrt(np.mean(angle**2)))
     return out
+
+
+class Swings(NamedTuple):
+    """Remarks about axes, and the time bias of the accelerometer against the gyros; None where nothing shows it."""
+
+    remarks: list[Finding]
+    bias: TimeBias | None
+
+
+def oscillation_of(found: Sources) -> Swings:
+    """Compare accelerometer and gyros by the oscillation of the vehicle; ``triads-axes`` or none."""
+    # the filter's package, loaded where there are tables alone
+    from recon.imu_screening import bridge
+    from recon.oscillation import DELIVERED, LAG, LAG_STEP_S, axes_check, oscillation
+
+    force, rate = found.triads.get("accelerometer"), found.triads.get("rates")
+    if force is None or rate is None or found.spec.motion.model != "strapdown":
+        return Swings([], None)
+    try:
+        sensors = bridge(force, 0), bridge(rate, 1)
+    except GateError:
+        return Swings([], None)
+    swings = oscillation(*sensors, -np.inf, np.inf, found.vehicle)
+    if swings is None:
+        return Swings([], None)
+    if swings.kind in (DELIVERED, LAG):
+        return Swings([], TimeBias("accelerometer", "rates", swings.lag_s, LAG_STEP_S / 2.0))
+    check = axes_check(swings, *sensors)
+    span = float(force.time_s[0]), float(force.time_s[-1])
+    return Swings([Finding("accelerometer, rates", check.remark, *span, "triads-axes")], None)
