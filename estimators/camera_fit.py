@@ -4,7 +4,7 @@ Where the shell is may be known from the frame before; else it is sought: where 
 is from far, where the map of features or of the valleys between tori fits (behind the rim may be the Earth, whose limb
 is an edge too). Edge and features near there are fitted (`estimators.frame_solution`), each also by itself: where they
 contradict each other a whole edge counts, and a frame whose edge is not whole is refused. So is a frame that a
-deflection does not explain (`estimators.frame_checks`), or that shows the edge twice (`estimators.second_edge`).
+deflection does not explain (`estimators.frame_checks`), or that shows the edge twice (`estimators.edge`).
 
 Assumed: as in `estimators.frame_solution`.
 
@@ -27,6 +27,7 @@ from estimators.edge import (
     HorizonLine,
     breaks_across,
     fault_of_frame,
+    fault_of_second_edge,
     is_coherent,
     no_horizon,
 )
@@ -49,7 +50,6 @@ from estimators.frame_solution import (
     least_points,
     refused_fit,
 )
-from estimators.second_edge import fault_of_second_edge
 from estimators.virtual_camera import DEFLECTION, RADIUS
 from flightmodel.checks import Fault, FloatArray
 
@@ -204,7 +204,7 @@ class OrientedCamera(FrameModel):
             )
 
     def _check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
-        """Refuse a frame that shows the edge twice, by `estimators.second_edge`."""
+        """Refuse a frame that shows the edge twice, by `estimators.edge`."""
         rows = edge_residuals(self.view, horizon, deformation).rows
         seen = np.asarray(np.isfinite(rows).all(axis=1))
         fault = fault_of_second_edge(frame.image, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])

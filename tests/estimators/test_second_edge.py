@@ -6,10 +6,9 @@ import pytest
 
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_mixed
-from estimators.edge import no_horizon
+from estimators.edge import fault_of_second_edge, no_horizon
 from estimators.frame_residuals import edge_residuals
 from estimators.frame_solution import refused_fit
-from estimators.second_edge import fault_of_second_edge
 from estimators.virtual_camera import DEFLECTION, RADIUS
 from flightmodel.checks import Fault
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
