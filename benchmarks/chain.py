@@ -13,8 +13,7 @@ from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from postflight.deflections import estimate_camera
 from postflight.flight import read_flight
-from postflight.loads import loads_from_solution
-from postflight.reconstruction import reconstruct
+from postflight.reconstruction import loads_from_solution, reconstruct
 from recon.reconstruct import reconstruct as solve
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder

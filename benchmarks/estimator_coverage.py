@@ -44,7 +44,7 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.fusing import fuse_flight
-from postflight.loads import loads_from_solution
+from postflight.reconstruction import loads_from_solution
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from tests import wide_flights

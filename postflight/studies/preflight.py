@@ -25,8 +25,7 @@ from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
-from postflight.loads import fastest_radps
-from postflight.reconstruction import Reconstruction
+from postflight.reconstruction import Reconstruction, fastest_radps
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
     AeroDispersions,

@@ -15,7 +15,7 @@ from flightmodel.earth import undulation_m
 from flightmodel.instruments import TriadSpec
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight import loads, reconstruction
+from postflight import reconstruction
 from postflight.checks import inertial
 from postflight.checks.pressure_and_field import field_rotation
 from postflight.checks.track_force import _compare, track_force
@@ -140,7 +140,7 @@ def made_pulse(seed=0, noise=0.004):
         air=SimpleNamespace(wind_sd_mps=4.0 * one), dynamic_pressure_pa=one, dynamic_pressure_sd_pa=one,
         airspeed_mps=800.0 * one,
     )  # fmt: skip
-    return loads.loads_from_solution(telemetry, bet, air), bet.triad_root, velocity
+    return reconstruction.loads_from_solution(telemetry, bet, air), bet.triad_root, velocity
 
 
 def test_pulse_data_state_their_noise_and_the_flow_s_errors():
@@ -628,12 +628,12 @@ def test_windows_of_a_vehicle_that_pitches_fast_are_short_enough():
     air = SimpleNamespace(mach=np.array([mach]), dynamic_pressure_pa=np.array([pressure_pa]))
     at = SimpleNamespace(time_s=np.zeros(1))
     bet = SimpleNamespace(smoothed=at, imu_time_s=at.time_s, rate_body_radps=np.array([[spin, 0.0, 0.0]]))
-    fastest = loads.fastest_radps(vehicle, bet, air)
+    fastest = reconstruction.fastest_radps(vehicle, bet, air)
     assert fastest == pytest.approx(2.0 * np.pi * frequency + spin, rel=0.02)
     # of an acceleration that turns at that rate no more is left out than at 2.5 Hz by the usual window
     t = np.arange(0.0, 2.0, 1e-4)
     turning = np.column_stack([0.0 * t, np.cos(fastest * t), np.sin(fastest * t)])
     seen = SimpleNamespace(imu_time_s=t, specific_force_body_mps2=0.0 * turning, rate_body_radps=turning)
-    h = loads._MOST_TURN_RAD / fastest
+    h = reconstruction._MOST_TURN_RAD / fastest
     got = atmosphere.cg_accelerations(seen, np.array([1.0]), np.zeros(3), h).angular_acceleration_radps2[0]
     assert np.linalg.norm(got) / fastest == pytest.approx(0.968, abs=0.003)
