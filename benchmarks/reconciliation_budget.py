@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from flightmodel import rotations
 from flightmodel.atmosphere import profile_from_sounding
 from postflight.flight import Flight
-from postflight.reconciliation.fit import estimate_turbulence_share, problem_of, reconcile
+from postflight.reconciliation.fit import estimate_turbulence_share, problem_of, reconcile, resolved
 from postflight.reconciliation.forward_model import (
     DAMPING_LOG_SD,
     OFFSET_SD_M,
@@ -41,7 +41,6 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.gauss_newton import INSTRUMENTS, Parameters
 from postflight.reconciliation.posterior import SURELY_RESOLVED
-from postflight.reconciliation.start import resolved
 from postflight.reconstruction import reconstruct
 from recon.atmosphere import cg_accelerations
 from tests.wide_flights import flown, wide_flight
