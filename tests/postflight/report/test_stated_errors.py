@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from flightmodel.flightfolder import read_flight
-from postflight.report import stated_errors
+from postflight.report import write
 from postflight.report.source import read_run
 from tests.in_process import runner
 from tests.refusing import printed_codes
@@ -77,14 +77,14 @@ def test_check_names_what_is_assumed(clean_flight, capsys, monkeypatch):
 
 def test_the_lines_offered_can_be_pasted_and_hold_the_noise_that_was_drawn(run):
     """A synthetic flight states the noise that its radars have: measured within 10 %, of 450 points each."""
-    offered = tomllib.loads(stated_errors.measured(run))
+    offered = tomllib.loads(write.measured(run))
     assert set(offered["radars"]) == set(run.telemetry.radars)
     for name, keys in offered["radars"].items():
         site = run.telemetry.radars[name].spec
         wanted = {"range_sd_m": site.range_sd_m}
         wanted |= dict.fromkeys(("azimuth_sd_deg", "elevation_sd_deg"), float(np.rad2deg(site.angle_sd_rad)))
         assert keys == pytest.approx(wanted, rel=0.1)
-    assert re.search(r"# time bias: [-+]", stated_errors.measured(run))
+    assert re.search(r"# time bias: [-+]", write.measured(run))
 
 
 def test_noise_that_is_stated_otherwise_is_offered_as_it_is(run):
@@ -94,12 +94,12 @@ def test_noise_that_is_stated_otherwise_is_offered_as_it_is(run):
     residuals.loc[residuals["component"] == "range", "rms_normalised"] *= 0.5
     tables = run.tables | {"residual_statistics": residuals}
     other = replace(run, header=run.header | {"sensors": sensors}, tables=tables)
-    assert tomllib.loads(stated_errors.measured(other)) == tomllib.loads(stated_errors.measured(run))
+    assert tomllib.loads(write.measured(other)) == tomllib.loads(write.measured(run))
 
 
 def test_report_and_provenance_name_what_was_assumed(run, report):
     other = replace(run, header=run.header | {"assumed": {"gnss.a": {"x_sd": 2.0}}})
-    assert stated_errors.assumed(other) == [("gnss.a", "x_sd = 2")]
+    assert write.assumed(other) == [("gnss.a", "x_sd = 2")]
     assert run.header["assumed"] == run.telemetry.assumed
     text = report.read_text()
     assert ("<h3>Assumed</h3>" in text) == bool(run.telemetry.assumed)
