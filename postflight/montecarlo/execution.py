@@ -34,7 +34,6 @@ import numpy as np
 
 from flightmodel.checks import ConfigError, GateError, Progress
 from flightmodel.files import file_bytes, write_file
-from postflight.montecarlo import trial
 from postflight.montecarlo.bands import (
     Chunk,
     chunk_from_rows,
@@ -44,7 +43,7 @@ from postflight.montecarlo.bands import (
     remove_partial,
     write_chunk,
 )
-from postflight.montecarlo.study import Stop, Study, read_study, sobol_study
+from postflight.montecarlo.study import Stop, Study, read_study, run_trials, sobol_study, whole_trial
 from postflight.streams import THREAD_VARIABLES, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
@@ -59,7 +58,7 @@ def fly_chunk(study: Study, job: Job) -> Done:
     """Fly the runs of one job; a flight that fails is a row with its reason."""
     number, runs = job
     if study.spec.mode == "whole":
-        rows = trial.run_trials(partial(trial.whole_trial, study.plan, study.spec.seed), study.plan, runs)
+        rows = run_trials(partial(whole_trial, study.plan, study.spec.seed), study.plan, runs)
     else:
         rows = fly_runs(study.plan, runs, study.draws_of)
     return number, chunk_from_rows(rows, study.plan.scalars)

@@ -17,7 +17,7 @@ from scipy.stats import binom
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.files import PARTIAL, machine
 from flightmodel.vehicle import DATA
-from postflight.montecarlo import commands, execution, trial
+from postflight.montecarlo import commands, execution
 from postflight.montecarlo.bands import (
     chunk_path,
     coverage,
@@ -28,7 +28,7 @@ from postflight.montecarlo.bands import (
     write_merged,
 )
 from postflight.montecarlo.execution import Wanted, status, study_of
-from postflight.montecarlo.study import Stop, read_study
+from postflight.montecarlo.study import METHODS, TRIAL_SCALARS, Stop, read_study, run_trials, whole_trial
 from synthetic_flight import ensemble
 from tests.refusing import refuses
 
@@ -327,13 +327,13 @@ def test_a_whole_trial_recovers_its_truth(tmp_path):
     shipped = (DATA / "dispersions" / "irve2_whole.toml").read_text()
     text = shipped.replace('scenario = "irve2_reference"', 'scenario = "short.toml"')
     study = read_study(str(write_short(tmp_path, text, ENTRY)))
-    plan = replace(study.plan, scalars=trial.SCALARS)
-    rows = trial.run_trials(partial(trial.whole_trial, plan, 3), plan, [1])
+    plan = replace(study.plan, scalars=TRIAL_SCALARS)
+    rows = run_trials(partial(whole_trial, plan, 3), plan, [1])
     found = rows[0].scalars
     assert rows[0].reason == ""
-    assert np.isfinite([found[name] for name in trial.SCALARS]).all()
+    assert np.isfinite([found[name] for name in TRIAL_SCALARS]).all()
     assert found["truth_deg"] > 1.0
-    for method in trial.METHODS:
+    for method in METHODS:
         # one flight: within four of its own standard deviations
         assert abs(found[f"{method}_error_deg"]) < 4.0 * found[f"{method}_sd_deg"]
     assert found["bet_position_m"] < 100.0
