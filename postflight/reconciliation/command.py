@@ -40,11 +40,10 @@ from postflight.reconciliation.posterior import (
     stiffness_bound,
     vehicle_file_lines,
 )
-from postflight.reconciliation.without_fit import ENTRIES, without_fit
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
 from postflight.studies.commands import bands, compared_with_bounds
-from postflight.studies.preflight import Bounds, entry_bounds, rigid_bounds
+from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, rigid_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from recon.consistency import ConsistencyCheck

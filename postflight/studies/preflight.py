@@ -9,6 +9,8 @@ flight's own entry.
 References
 ----------
 Bose et al., AIAA 2011-2571, Figure 1.3.
+
+What of a reconciliation does not need the fit? The second process does it, and loads nothing else for it.
 """
 
 from __future__ import annotations
@@ -22,9 +24,11 @@ from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
+from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
+from postflight.deflections import estimate
 from postflight.reconstruction import Reconstruction, fastest_radps
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
@@ -50,6 +54,7 @@ RECORD_S, SPAN_S = 0.05, 70.0
 # steps of a slow vehicle; of a faster one so many that it turns by `STEP_RAD` in each: fourth-order steps then err by
 # 1e-6 rad
 RIGID_STEP_S, FLEXIBLE_STEP_S, STEP_RAD = RECORD_S / 3.0, 0.005, 0.15
+ENTRIES = 300
 
 
 @dataclass(frozen=True)
@@ -233,3 +238,8 @@ def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) 
         wind[:, axis] += profile.wind_sd_mps * correlated(z, 3000.0, rng)
     ratio = profile.log_density_ratio + profile.density_sd * correlated(z, 5000.0, rng)
     return replace(profile, log_density_ratio=ratio, wind_ned_mps=wind)
+
+
+def without_fit(flight: Reconstruction) -> tuple[DeflectionHistory | None, Bounds]:
+    """Fused deflection, and bands of entries with the joint locked."""
+    return estimate(flight, ("fused",)).histories.get("fused"), rigid_bounds(flight, ENTRIES)
