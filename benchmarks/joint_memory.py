@@ -36,7 +36,7 @@ from flightmodel.flightfolder import read_flight
 from flightmodel.statistics import correlation_root
 from postflight.deflections import estimate
 from postflight.flight import Flight
-from postflight.reconciliation.credibility import credibility
+from postflight.reconciliation.command import credibility
 from postflight.reconciliation.fit import select_laws
 from postflight.reconciliation.posterior import deflection_of, joint_table
 from postflight.reconstruction import reconstruct

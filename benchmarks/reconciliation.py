@@ -31,8 +31,7 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.flight import Flight
-from postflight.reconciliation.command import Reconciliation
-from postflight.reconciliation.credibility import credibility
+from postflight.reconciliation.command import Reconciliation, credibility
 from postflight.reconciliation.fit import select_laws
 from postflight.reconciliation.posterior import deflection_of, joint_table, stiffness_bound
 from postflight.reconstruction import reconstruct

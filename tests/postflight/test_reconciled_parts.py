@@ -9,7 +9,7 @@ import pytest
 from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.reconciliation.credibility import MOST_MOVED_SD, credibility
+from postflight.reconciliation.command import MOST_MOVED_SD, credibility
 from postflight.reconciliation.fit import CreepScore, JointFit, require_damping, with_freeplay
 from postflight.reconciliation.forward_model import (
     FAST_JOINT,

@@ -18,7 +18,7 @@ from flightmodel.checks import GateError
 from flightmodel.flightfolder import read_flight
 from postflight.cli import cli
 from postflight.flight import Flight
-from postflight.reconciliation.credibility import credibility
+from postflight.reconciliation.command import credibility
 from postflight.reconciliation.fit import mismatched_spans, reconcile, reconcile_with_freeplay, select_laws
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
