@@ -308,7 +308,7 @@ class RadarSite(InstrumentSpec):
     latitude_rad, longitude_rad, height_m : float
         WGS-84.
     angle_servo_hz : float
-        Bandwidth of the servo with which the antenna follows the target (`recon.tracking_servo`); 0: it does not lag.
+        Bandwidth of the servo with which the antenna follows the target (`recon.measurements`); 0: it does not lag.
 
     All others are standard deviations, one row each.
     """

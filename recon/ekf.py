@@ -39,8 +39,8 @@ from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.earth import WGS84, Planet
 from flightmodel.trajectory import nearest_index
 from recon import _filter_kernels, _measurement_kernels
-from recon._measurement_kernels import SLOTS
-from recon.measurements import Instrument, NodeMotion, predict, wrapped
+from recon._measurement_kernels import RADAR, SLOTS
+from recon.measurements import Instrument, NodeMotion, predict, servo_lag, wrapped
 from recon.propagation import SAME_INSTANT_S, Motion, propagate
 from recon.settings import COMPILED
 from recon.state import KINEMATIC, ROTATION, ErrorModel, States, boxminus, boxplus, packed, right_jacobian
@@ -145,6 +145,9 @@ class Innovations(NamedTuple):
     gain: FloatArray
     by_state: FloatArray
     by_error: FloatArray
+
+
+_LEAST_NODES = 4  # of a path that servos follow
 
 
 @dataclass(frozen=True)
@@ -258,6 +261,18 @@ class Problem:
             ),
             index,
         )
+
+
+def with_servo_lag(problem: Problem, states: States | None) -> Problem:
+    """Problem whose radars lag behind a path through all its nodes; as it is without servos, or a path."""
+    lagging = [k for k, one in enumerate(problem.instruments) if one.kind == RADAR and one.servo_hz > 0.0]
+    if states is None or not lagging or len(problem.time_s) < _LEAST_NODES:
+        return problem
+    known, at_s = problem.observed.known.copy(), problem.time_s[problem.node]
+    for number in lagging:
+        mine = problem.observed.source == number
+        known[mine, 1:] = servo_lag(problem.instruments[number], problem.time_s, states, at_s[mine])
+    return replace(problem, observed=problem.observed._replace(known=known))
 
 
 def observe(time_s: FloatArray, instruments: tuple[Instrument, ...]) -> tuple[Observed, IntArray]:

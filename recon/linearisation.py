@@ -32,11 +32,10 @@ from flightmodel.checks import FloatArray
 from recon import ekf, propagation, setup, single_faults, smoother
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, consistency_check
-from recon.ekf import Problem
+from recon.ekf import Problem, with_servo_lag
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
-from recon.tracking_servo import with_servo_lag
 
 THINNED_STEP_S = 0.5  # one only linearises about that path
 _MOST_THINNED_PASSES = 6  # a bound: the passes with all points go on from there

@@ -11,7 +11,7 @@ Errors of the gyros move ``dp/dt`` by ``C (dw x d)``, a clock late by ``e`` by `
 and noise:
 
 * radar: range, azimuth, elevation of ``p`` from the site, with the pedestal's errors (RCC 753-95), the lag of its servo
-  (`recon.tracking_servo`, ``1 + e`` times the one of the path about which one is linearised), residual
+  (below, ``1 + e`` times the one of the path about which one is linearised), residual
   refraction, ``N cot(E)`` for a ray through the whole atmosphere, and errors of the site's survey, its own and those
   common to all sites: with a stated place ``d`` off the true one, ``r = (1 - rho x) (R (p - site) + d)``, where ``rho``
   is the turn of north, east and down over ``d`` on the Earth;
@@ -30,6 +30,18 @@ A tracker's angle noise is noise of its line of sight: ``angle_sd`` in elevation
 ``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` is ``"axis"`` for a radar whose azimuth readings
 scatter by ``angle_sd`` at any elevation. The numpy form below serves the filterpy engine; compiled:
 `recon._measurement_kernels`.
+
+The antenna follows the target as a second-order servo without velocity lag: damping and integral of the angle's error
+drive it, ``F(s) = (2 z w s + w^2) / (s^2 + 2 z w s + w^2)`` with ``w`` its bandwidth and ``z = 1 / sqrt(2)``
+(Butterworth), so that the encoders read ``angle + (F - 1) angle``. The lag ``(F - 1) angle``, for slow motion
+``- acceleration / w^2``, is that of a path: of the one about which the filter is linearised, made anew for every pass.
+What the pass itself moves the path by is smoother than the path, and its own lag the next pass has. A bandwidth that is
+not known exactly makes the lag larger or smaller at all times: the error state "servo lag" is the fraction, twice that
+of ``1 / w``.
+
+References
+----------
+RCC 753-95 (dynamic lag). Skolnik, Radar Handbook, 3rd ed., 9.10: errors of servos.
 """
 
 from __future__ import annotations
@@ -57,11 +69,13 @@ from recon._measurement_kernels import (
     VELOCITY,
 )
 from recon.propagation import Motion
-from recon.state import DRIVERS, ErrorModel, right_jacobian
+from recon.state import DRIVERS, ErrorModel, States, right_jacobian
 
 REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
+# the servo's lag is exact for an angle that runs straight between steps: the path's own steps are a tenth of a second
+_STEPS_A_PERIOD, _STEPS_S = 50, (0.01, 0.1)
 _SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
@@ -474,6 +488,42 @@ def sight(n: Any, east: Any, d: Any) -> tuple[Any, Any, Any]:
     """Range, azimuth, elevation of a point north, east, down of a site, or of points (k,)."""
     level = np.hypot(n, east)
     return np.hypot(level, d), np.arctan2(east, n), np.arctan2(-d, level)
+
+
+def servo_lag(instrument: Instrument, time_s: FloatArray, states: States, at_s: FloatArray) -> FloatArray:
+    """Lag (k, 2) of azimuth and elevation behind a path, rad: reading minus angle.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        Radar with the bandwidth of its servo, Hz.
+    time_s : (n,) float
+        Nodes of the path, s.
+    states : States
+        At the nodes.
+    at_s : (k,) float
+        Times of the readings, s; the servo has settled on the target where the path begins.
+    """
+    from scipy import signal  # half a second to import
+    from scipy.interpolate import CubicHermiteSpline
+
+    c = rotations.dcm_from_q(states.q_ecef_body)
+    point = CubicHermiteSpline(time_s, states.position_ecef_m + c @ instrument.arm_body_m, states.velocity_ecef_mps)
+    step_s = float(np.clip(1.0 / (_STEPS_A_PERIOD * instrument.servo_hz), *_STEPS_S))
+    even_s, step_s = np.linspace(
+        time_s[0], time_s[-1], 1 + int(np.ceil((time_s[-1] - time_s[0]) / step_s)), retstep=True
+    )
+    ned = (point(even_s) - instrument.site_ecef_m) @ instrument.dcm.T
+    _, azimuth, elevation = sight(*ned.T)
+    angles = np.column_stack([np.unwrap(azimuth), elevation])
+    # a straight line has no lag, and without that of the start there is no transient
+    start, rate = angles[0], (angles[1] - angles[0]) / step_s
+    bent = angles - start - rate * (even_s - even_s[0])[:, None]
+    w = 2.0 * np.pi * instrument.servo_hz
+    behind = ([-1.0, 0.0, 0.0], [1.0, 2.0 * instruments.BUTTERWORTH * w, w * w])
+    top, bottom, _ = signal.cont2discrete(behind, step_s, method="foh")
+    lag = signal.lfilter(np.ravel(top), bottom, bent, axis=0)
+    return np.column_stack([np.interp(at_s, even_s, column) for column in lag.T])
 
 
 def sight_partials(n: float, east: float, d: float) -> FloatArray:

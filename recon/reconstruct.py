@@ -58,7 +58,7 @@ from recon import (
 )
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, held_out_table
-from recon.ekf import Problem
+from recon.ekf import Problem, with_servo_lag
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UNMODELLED_CODE,
@@ -75,7 +75,6 @@ from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
 from recon.smoother import Smoothed
 from recon.state import KINEMATIC, States, unpacked
-from recon.tracking_servo import with_servo_lag
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 _UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything

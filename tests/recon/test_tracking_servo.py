@@ -11,11 +11,10 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.instruments import RadarEntry
 from recon._measurement_kernels import RADAR
-from recon.measurements import Instrument
+from recon.measurements import Instrument, servo_lag
 from recon.reconstruct import reconstruct, reconstruct_once
 from recon.settings import Settings
 from recon.state import States
-from recon.tracking_servo import servo_lag
 
 QUICK = Settings(output_rate_hz=5.0)
 HZ = 0.3
