@@ -12,6 +12,12 @@ Joins the siblings: corrected sensors at the c.g. and air data along the reconst
 averaged over a window short enough for the joint's own oscillation,
 
     f_cg = mean(f) + w' x r + w x (w x r),     w' from the rates half a window apart.
+
+Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? A range's check, every run.
+
+The history of `recon.vector_attitude` minus the smoothed trajectory's attitude, about three body axes, against the sum
+of both covariances: NEES ``d^T (P_directions + P_trajectory)^-1 d`` and the share inside three standard deviations. It
+is independent where the trajectory neither used these sensors nor was started from them. See docs/attitude.md.
 """
 
 from __future__ import annotations
@@ -25,16 +31,16 @@ import pandas as pd
 from estimators.loads import FlightLoads
 from estimators.trim import SLOPE_AT_RAD
 from flightmodel import airdata, earth, rotations
-from flightmodel.airdata import AirData, angle_partials, derived_with_sd, is_angle, lateral_angles
+from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
 from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
 from flightmodel.events import find_peak
+from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, Telemetry
-from flightmodel.trajectory import Trajectory
+from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
-from postflight.attitude import AttitudeCheck, check_attitude
 from postflight.flight import Flight
 from recon.atmosphere import (
     HALF_WINDOW_S,
@@ -51,6 +57,15 @@ from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
 from recon.survey import rests_on
+from recon.vector_attitude import (
+    LEAST_INSIDE,
+    AttitudeComparison,
+    AttitudeHistory,
+    reconstruct_attitude,
+    track,
+)
+from recon.vector_attitude import Settings as AttitudeSettings
+from recon.vector_attitude import compare as compare_attitudes
 
 Columns = dict[str, FloatArray]
 # quantity of `airdata.derived` and its column
@@ -94,6 +109,13 @@ _FORCE_NAMES = (
 # of the angular acceleration this half window leaves out 0.5 % at 1 Hz and 3 % at 2.5 Hz; so does a shorter one of a
 # vehicle that pitches and spins faster. At least some samples must lie in it
 _HALF_WINDOW_S, _MOST_TURN_RAD, _LEAST_SAMPLES = 0.02, 0.31, 2.5
+_RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+# why the check is not independent, by code
+DEPENDENCE = {
+    "": "",
+    "filter": "this check is not independent: the trajectory's filter used these sensors too",
+    "start": "this check is not independent: the trajectory's attitude was started from these sensors",
+}
 
 
 @dataclass(frozen=True, repr=False)
@@ -528,3 +550,104 @@ def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> fl
     square = air.dynamic_pressure_pa[peak] * vehicle.reference.area_m2 * restoring_m / inertia
     spin = np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0])
     return float(np.sqrt(max(square, 0.0)) + abs(spin))
+
+
+@dataclass(frozen=True)
+class AttitudeCheck:
+    """Attitude from directions, and its comparison with the trajectory's.
+
+    Parameters
+    ----------
+    history : AttitudeHistory or None
+        None where the sensors determine no attitude; a finding gives the reason.
+    comparison : AttitudeComparison or None
+    dependence : str
+        ``"filter"`` or ``"start"`` where the trajectory itself depends on these sensors, empty where it does not.
+    findings : tuple of Finding
+    confidence : float
+    """
+
+    history: AttitudeHistory | None
+    comparison: AttitudeComparison | None
+    dependence: str
+    findings: tuple[Finding, ...]
+    confidence: float
+
+    @property
+    def remark(self) -> str:
+        """Result in a sentence, with what limits it."""
+        result = "" if self.comparison is None else self.comparison.words
+        return "; ".join(part for part in (result, DEPENDENCE[self.dependence]) if part)
+
+    @property
+    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+        """Size of the differences, their share inside three standard deviations, and the sensors' own residuals."""
+        if self.comparison is None or self.history is None:
+            return ()
+        nees, inside = self.comparison.mean_nees, self.comparison.share_inside
+        high = chi_square_quantile(self.confidence, 3)
+        return (
+            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
+            ConsistencyCheck(
+                "attitude-coverage",
+                "attitude check share inside",
+                inside,
+                LEAST_INSIDE,
+                1.0,
+                inside >= LEAST_INSIDE,
+                self.remark,
+            ),
+            *(
+                ConsistencyCheck(**{**vars(v), "name": f"attitude check {v.name}"})
+                for v in self.history.consistency_checks
+            ),
+        )
+
+
+def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeCheck | None:
+    """Attitude from directions over the trajectory's span, compared; None without sensors or without an attitude."""
+    if telemetry.magnetometer is None or telemetry.sun is None or bet.provenance["motion"] == "ballistic":
+        return None
+    settings = bet.settings
+    dependence = ""
+    if settings.attitude_sensors:
+        dependence = "filter"
+    elif telemetry.attitude_prior is None:
+        dependence = "start"
+    history, comparison = None, None
+    found: list[Finding] = []
+    try:
+        t, points = track(telemetry)
+        ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
+        at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
+        chosen = AttitudeSettings(rate_hz=_RATE_HZ, confidence=settings.check_confidence)
+        history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
+        comparison = compare_attitudes(history, bet.smoothed, settings.check_confidence)
+        found += history.findings
+    except GateError as fault:
+        found.append(Finding("attitude check", str(fault), np.nan, np.nan, "attitude-check-missing"))
+    return AttitudeCheck(history, comparison, dependence, tuple(found), settings.check_confidence)
+
+
+def attitude_table(check: AttitudeCheck, bet: TrajectorySolution) -> pd.DataFrame:
+    """Return ``attitude_check.csv``: the independent attitude, its difference from the trajectory's, and all sds."""
+    history, comparison = check.history, check.comparison
+    assert history is not None
+    assert comparison is not None
+    rows = np.searchsorted(history.time_s, comparison.time_s)
+    path = resample(bet.smoothed, comparison.time_s)
+    assert path.covariance is not None
+    latitude, longitude, _ = earth.geodetic_from_ecef(path.position_ecef_m, path.planet)
+    dcm = earth.dcm_ned_ecef(latitude, longitude) @ rotations.dcm_from_q(history.q_ecef_body[rows])
+    columns = {"t_s": comparison.time_s}
+    angles = zip(("roll", "pitch", "yaw"), euler_321(dcm), strict=True)
+    columns |= {f"{name}_ned_deg": np.rad2deg(angle) for name, angle in angles}
+    parts = {
+        "difference_{}_body_deg": comparison.difference_body_rad,
+        "difference_{}_body_sd_deg": comparison.sd_body_rad,
+        "independent_{}_body_sd_deg": np.sqrt(np.diagonal(history.covariance[rows], axis1=1, axis2=2)),
+        "bet_{}_body_sd_deg": path.sd()[:, 6:9],
+    }
+    for pattern, values in parts.items():
+        columns |= {pattern.format(a): np.rad2deg(column) for a, column in zip("xyz", values.T, strict=True)}
+    return pd.DataFrame(columns)

@@ -37,10 +37,9 @@ from flightmodel.earth import WGS84, name_of
 from flightmodel.files import abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Finding, Telemetry
-from postflight.attitude import AttitudeCheck, attitude_table
 from postflight.deflections import Deflections, quantiles_at
 from postflight.filming import NO_VIDEO
-from postflight.reconstruction import Reconstruction
+from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.consistency import ConsistencyCheck
 from recon.measurements import component_unit
 

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
-from postflight.attitude import AttitudeCheck
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, stamp
-from postflight.reconstruction import Reconstruction
+from postflight.reconstruction import AttitudeCheck, Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 from recon.measurements import component_unit

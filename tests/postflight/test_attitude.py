@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from postflight.attitude import DEPENDENCE, attitude_table, check_attitude
 from postflight.flight import Flight
-from postflight.reconstruction import reconstruction_from
+from postflight.reconstruction import DEPENDENCE, attitude_table, check_attitude, reconstruction_from
 from postflight.run_folder import attitude_summary
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import reconstruct_once

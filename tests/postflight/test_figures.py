@@ -12,7 +12,6 @@ import pytest
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
 from postflight import plots
-from postflight.attitude import check_attitude
 from postflight.flight import Flight
 from postflight.plots import style
 from postflight.plots.style import in_style, save
@@ -22,7 +21,7 @@ from postflight.plots.trajectory import (
     figure_residuals,
     figure_sensitivity,
 )
-from postflight.reconstruction import reconstruction_from
+from postflight.reconstruction import check_attitude, reconstruction_from
 from postflight.sensitivity import sensitivity
 from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
