@@ -1,7 +1,8 @@
 """Which stable codes does the program print, and what does each message say?
 
-Read from the source: every call that makes a refusal, a finding or a consistency check with a code. Values and names in
-a message are shown as dots. ``python docs/message_codes.py`` prints the page.
+Read from the source: every call that makes a refusal, a finding or a consistency check with a code, and every other
+text that looks like a code and is not among `NO_CODES`: one that comes by way of a variable. Values and names in a
+message are shown as dots. ``python docs/message_codes.py`` prints the page.
 """
 
 import ast
@@ -15,15 +16,24 @@ OPEN = "..."
 # of a call: which argument is the code, which the words
 CALLS = {
     **dict.fromkeys(("GateError", "ConfigError", "DivergenceError", "TableRangeError"), (1, 0)),
-    **dict.fromkeys(("Fault", "refuse", "refuse_config", "_NoFitError", "__init__"), (1, 0)),
+    **dict.fromkeys(("Fault", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
     "Finding": (4, 1),
     "FaultHypothesis": (1, 0),
-    "line": (2, 1),
+    **dict.fromkeys(("line", "_line"), (2, 1)),
+    "data_sheet_check": (0, 8),
     "Single": (0, 1),
     "_of_either": (0, 1),
     "consistency_check": (0, 6),
     "ConsistencyCheck": (0, 6),
 }
+# words with a hyphen that are none: encodings, headers of a page, commands and their folders, units, parts of words,
+# effects that `postflight.systematic_differences` names
+NO_CODES = {
+    "utf-8", "utf-8-sig", "utf-16", "latin-1", "no-referrer", "no-store", "same-origin", "retry-failed",
+    "shell-test", "demo-flight", "study-damping", "study-stiffness", "study-preflight", "study-shell-test",
+    "milli-g", "non-orthogonality", "pre-flight", "wind-relative", "time-offset", "track-rotation", "attitude-body",
+    "attitude-earth", "inertial-velocity", "other-point",
+}  # fmt: skip
 Known = dict[str, ast.expr]
 
 
@@ -59,6 +69,8 @@ def codes_of(node: ast.expr, known: Known) -> list[str]:
         return [node.value]
     if isinstance(node, ast.IfExp):
         return codes_of(node.body, known) + codes_of(node.orelse, known)
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "getattr" and len(node.args) == 3:
+        return codes_of(node.args[2], known)
     if isinstance(node, ast.Name) and node.id in known:
         return codes_of(known[node.id], {name: value for name, value in known.items() if name != node.id})
     return []
@@ -90,22 +102,45 @@ def calls(tree: ast.Module) -> list[tuple[ast.Call, Known]]:
     return list(out.items())
 
 
+def codes_by_name(tree: ast.Module) -> dict[str, str]:
+    """Texts of a module that look like codes of two words or more, each with the longest text in its own expression."""
+    above = {child: parent for parent in ast.walk(tree) for child in ast.iter_child_nodes(parent)}
+    out = {}
+    for node in ast.walk(tree):
+        if not (isinstance(node, ast.Constant) and isinstance(node.value, str) and "-" in node.value):
+            continue
+        if not A_CODE.fullmatch(node.value) or node.value in NO_CODES or isinstance(above[node], ast.Expr):
+            continue
+        around: ast.AST = node
+        beside: list[str] = []
+        while not beside and not isinstance(around, ast.stmt):
+            around = above[around]
+            near = [part for part in ast.iter_child_nodes(around) if isinstance(part, ast.expr)]
+            beside = [text for part in near if " " in (text := words_of(part, {}))]
+        out[node.value] = max(beside, default="", key=said)
+    return out
+
+
 def message_codes() -> dict[str, str]:
     """Words of every code; of several messages with one code, the one of which most is known."""
     out: dict[str, str] = {}
+    by_name: dict[str, str] = {}
     for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
-        for call, known in calls(ast.parse(path.read_text(encoding="utf-8"))):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for code, text in codes_by_name(tree).items():
+            by_name[code] = max(by_name.get(code, ""), " ".join(text.split()), key=said)
+        for call, known in calls(tree):
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
             at_code, at_words = CALLS.get(name, (-1, -1))
             spread = [arg for arg in call.args for arg in [arg] * (1 + isinstance(arg, ast.Starred))]  # of two: a span
             given = dict(enumerate(spread)) | {word.arg: word.value for word in call.keywords}
-            code, words = given.get("code", given.get(at_code)), given.get(at_words, given.get("words"))
+            code, words = given.get("code", given.get(at_code)), given.get(at_words, given.get("words", given.get(1)))
             if name not in CALLS or code is None or words is None:
                 continue
             text = " ".join(re.sub(r"(\.\.\.[ ,;:']*){2,}", f"{OPEN} ", words_of(words, known)).split())
             for each in codes_of(code, known):
                 out[each] = max(out.get(each, ""), text, key=said)
-    return dict(sorted(out.items()))
+    return dict(sorted((by_name | out).items()))
 
 
 def page() -> str:

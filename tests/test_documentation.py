@@ -137,6 +137,31 @@ def test_page_of_codes_has_every_code_that_a_call_states():
     assert not stated - set(listed)
 
 
+A_CODE_OF_WORDS = re.compile(r'"([a-z][a-z0-9]*(?:-[a-z0-9]+)+)"')
+
+
+def test_page_of_codes_has_every_text_that_looks_like_one():
+    """A code that comes by way of a variable, too: what has a hyphen is listed, or named as none."""
+    module = message_codes()
+    sources = [path.read_text() for package in module.PACKAGES for path in (ROOT / package).rglob("*.py")]
+    written = {word for source in sources for word in A_CODE_OF_WORDS.findall(source)}
+    assert len(written) > 350
+    in_examples = {"my-flight"}
+    assert written - set(module.message_codes()) == module.NO_CODES | in_examples
+
+
+def test_page_of_codes_has_every_code_that_tests_expect():
+    listed, expected = message_codes().message_codes(), set()
+    for path in (ROOT / "tests").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "refuses":
+                expected |= {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
+            elif isinstance(node, ast.keyword) and node.arg == "codes" and isinstance(node.value, ast.Set):
+                expected |= {each.value for each in node.value.elts if isinstance(each, ast.Constant)}
+    assert len(expected) > 80
+    assert not expected - set(listed)
+
+
 @pytest.mark.parametrize(
     ("code", "words"),
     [("epoch-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
