@@ -23,6 +23,7 @@ Control 17 (1972) 439.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -122,18 +123,26 @@ def bounded_drivers(problem: Problem, states: States) -> States:
     return replace(states, sensor_errors=errors)
 
 
+Forward = Callable[[Problem, States | None], tuple[ekf.ForwardPass, States | None]]
+
+
 def converged(
-    thinned: Problem, engine: str, reference: States | None = None
+    thinned: Problem, engine: str, reference: States | None = None, forward: Forward | None = None
 ) -> tuple[Problem, ekf.ForwardPass, States]:
     """Thinned problem with its radars' lag, last forward pass and states to linearise about, rotations converged.
 
-    From the filter's own estimate on, or from a reference.
+    From the filter's own estimate on, or from a reference. ``forward`` makes a pass about one and says about which, as
+    `ekf.forward` does by itself; then one that the first pass does not move is the answer.
     """
     for k in range(_MOST_THINNED_PASSES):
         thinned = with_servo_lag(thinned, reference)
-        run = ekf.forward(thinned, reference, engine)
+        if forward is None:
+            run = ekf.forward(thinned, reference, engine)
+        else:
+            run, reference = forward(thinned, reference)
         smoothed = smoother.smooth(thinned, run, False, engine)
-        moved = np.abs(smoothed.x[:, ROTATION]).max() if k else np.inf
+        judged = k or (forward is not None and reference is not None)
+        moved = np.abs(smoothed.x[:, ROTATION]).max() if judged else np.inf
         reference = bounded_drivers(thinned, smoothed.states(run.charts))
         if moved < _CONVERGED_RAD:
             break
@@ -146,19 +155,17 @@ def first_reference(problem: Problem, settings: Settings) -> Start:
     thinned, kept = problem.thinned(THINNED_STEP_S)
     reference, phase = _chosen_phase(thinned, settings.engine)
     found: tuple[UnmodelledAcceleration, ...] = ()
-    for k in range(_MOST_THINNED_PASSES):
-        thinned = with_servo_lag(thinned, reference)
-        run, found = follow_track(thinned, reference, settings, found)
-        if k == 0 and problem.motion.ballistic and track_is_lost(thinned, run):
+
+    def following(part: Problem, about: States | None) -> tuple[ekf.ForwardPass, States | None]:
+        nonlocal found
+        run, found = follow_track(part, about, settings, found)
+        if about is None and problem.motion.ballistic and track_is_lost(part, run):
             # after a long gap the filter's prediction is far from the track: linearise about the tracking data
-            reference = setup.track_fit_states(problem.instruments, thinned.time_s, problem.model.size)
-            run, found = follow_track(thinned, reference, settings, ())
-        smoothed = smoother.smooth(thinned, run, False, settings.engine)
-        moved = np.abs(smoothed.x[:, ROTATION]).max() if reference is not None else np.inf
-        reference = bounded_drivers(problem, smoothed.states(run.charts))
-        if moved < _CONVERGED_RAD:
-            break
-    assert reference is not None
+            about = setup.track_fit_states(problem.instruments, part.time_s, problem.model.size)
+            run, found = follow_track(part, about, settings, ())
+        return run, about
+
+    _, _, reference = converged(thinned, settings.engine, reference, following)
     return Start(propagation.fill_between(problem.motion, problem.node_index, kept, reference), found, phase)
 
 
