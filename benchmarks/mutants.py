@@ -179,10 +179,11 @@ class Server:
     def __init__(self, tree: Path) -> None:
         self.tree, self.process = tree, None
 
-    def run(
-        self, tests: list[str], interpreted: bool, record: Path | None = None, limited: bool = True
-    ) -> tuple[str, str, float]:
-        """``("passed" | "failed" | "endless" | "broken", by what, seconds)`` of tests by file or name."""
+    def run(self, tests: list[str], interpreted: bool, record: Path | None = None) -> tuple[str, str, float]:
+        """``("passed" | "failed" | "endless" | "broken", by what, seconds)`` of tests by file or name.
+
+        A recording, of all tests of a package, may take as long as it does.
+        """
         if self.process is None or self.process.poll() is not None:
             self.process = subprocess.Popen(
                 [sys.executable, __file__, "--serve"], cwd=self.tree, env=environment(self.tree, False), text=True,
@@ -195,7 +196,6 @@ class Server:
             "interpreted": interpreted,
             "record": str(record or ""),
             "out": str(words),
-            "limited": limited,
         }
         start = time.monotonic()
         assert self.process.stdin is not None
@@ -237,7 +237,7 @@ def _run_in_child(job: dict) -> int:
         for stream in (1, 2):
             os.dup2(words.fileno(), stream)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    if job["limited"]:
+    if not job["record"]:
         resource.setrlimit(resource.RLIMIT_CPU, (LONGEST_S, LONGEST_S + 5))
     if job["interpreted"]:
         import numba
@@ -335,7 +335,7 @@ def recorded(server: Server, package: str) -> dict[str, dict]:
     now = digest(server.tree, *PACKAGES, f"tests/{package}")
     if not (kept.exists() and mark.exists() and mark.read_text() == now):
         print(f"recording which tests of {package} call what ...", flush=True)
-        state, by, seconds = server.run([f"tests/{package}"], False, kept, limited=False)
+        state, by, seconds = server.run([f"tests/{package}"], False, kept)
         if state != "passed":
             sys.exit(f"{package}: its own tests do not pass as they are: {state} {by}")
         mark.write_text(now)
@@ -386,7 +386,7 @@ def check_as_it_is(server: Server, mutants: list[Mutant]) -> None:
     """The interpreted tests pass without an error planted; of the others the recording has shown it."""
     files = sorted({t for one in mutants if one.in_kernel for t in one.tests})
     for name in files:
-        state, by, seconds = server.run([name], True, limited=False)
+        state, by, seconds = server.run([name], True)
         print(f"  as it is, interpreted: {name} {state} {seconds:.0f} s", flush=True)
         if state != "passed":
             sys.exit(f"{name} does not pass with interpreted kernels: {state} {by}")

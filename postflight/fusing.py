@@ -256,12 +256,21 @@ class _Sources:
 
     def shows_time_bias(self) -> bool:
         """Whether the deflection moves enough for the camera's time bias to be observed."""
-        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S), knots_of(self.loads))
+        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S), self.knot_s)
+
+    @property
+    def knot_s(self) -> float:
+        """Spacing of the fusion's knots."""
+        return knots_of(self.loads)
+
+    def fused(self, read: Read) -> Fused:
+        """Posterior of what a reader gives; `DivergenceError` without one."""
+        return fuse(read, knot_s=self.knot_s)
 
     def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> FusedAnswer:
         """Common posterior of some methods and the test of their agreement; `DivergenceError` without one."""
         read = self.reader(names, bias_sd_s, freed)
-        fused = fuse(read, knot_s=knots_of(self.loads))
+        fused = self.fused(read)
         # at the stated inputs, but with the readings' slopes at the posterior's: far inputs are curved
         inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
         back = {name: -mean for name, mean in inputs.items()}
@@ -380,7 +389,7 @@ def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
     """Estimate of a camera time bias stated as zero; None where there is no common answer with it free."""
     try:
         read = sources.reader(sources.names, _WIDE_BIAS_SD_S)
-        return _time_bias(fuse(read, knot_s=knots_of(sources.loads)), _WIDE_BIAS_SD_S, False)
+        return _time_bias(sources.fused(read), _WIDE_BIAS_SD_S, False)
     except DivergenceError:
         return None
 
