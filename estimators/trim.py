@@ -230,10 +230,6 @@ class StaticTrim:
             )
         return self.critical_stiffness_nmprad * (1.0 + growth) / growth
 
-    def offset_with_freeplay(self, offset_m: float, freeplay_rad: float) -> float:
-        """Offset, m, that a loaded joint with freeplay acts with."""
-        return offset_m + self.xbar_m * freeplay_rad
-
 
 def static_trim(vehicle: Vehicle, mach: float, dynamic_pressure_pa: float) -> StaticTrim:
     """Static trim of a vehicle from its coefficients' slopes.

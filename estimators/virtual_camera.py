@@ -203,10 +203,6 @@ class VirtualCamera:
         x = -(station + per * (aft - flattening * outwards))
         return np.column_stack([x, scale * points[:, 1], scale * points[:, 2]])
 
-    def edge_of(self, theta_rad: float, plane_lv_rad: float) -> ProjectedEdge:
-        """Project the shell's edge for a deflection angle and plane, rad."""
-        return self.edge(deformation_of(theta_rad, plane_lv_rad))
-
     def edge_clocks(self, count: int = 240) -> FloatArray:
         """Clocking angles of places spread evenly along the undeflected edge, inside the picture and off its border."""
         edge = self.edge(np.zeros(3))
@@ -229,10 +225,6 @@ class VirtualCamera:
         )
         inward /= np.linalg.norm(inward, axis=1, keepdims=True)
         return ScanLines(origin, inward, _OUTER_PX, _INNER_PX, index)
-
-    def scan_lines(self) -> ScanLines:
-        """Scan lines normal to the undeflected edge."""
-        return self.lines_at(self.edge_clocks(), np.zeros(3))
 
     def mismatch(self, horizon: HorizonLine, edge: ProjectedEdge) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals of found edge points against a projected edge.

@@ -164,12 +164,6 @@ class AeroTable:
         free = None if self.free_molecular is None else self.free_molecular * factor + shift
         return replace(self, coefficients=self.coefficients * factor + shift, free_molecular=free)
 
-    def with_constant_cmq(self, cmq: float) -> AeroTable:
-        """Copy with one pitch damping coefficient everywhere."""
-        changed = self.coefficients.copy()
-        changed[..., 3] = cmq
-        return replace(self, coefficients=changed)
-
 
 def check_axial_flow(path: Path, table: AeroTable) -> None:
     """Raise `GateError` where the air flows along the axis and yet pushes sideways or turns the shell."""

@@ -16,7 +16,6 @@ from flightmodel.checks import ConfigError, Fault, nearest_name
 from flightmodel.files import file_bytes
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
-Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
 Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]

@@ -340,15 +340,11 @@ class AttitudeComparison:
     time_s : (n,) float
     difference_body_rad, sd_body_rad : (n, 3) float
         About body axes, and their predicted standard deviation (both attitudes', as if independent).
-    rms_rad : float
-        Of the total angle.
     mean_body_rad : (3,) float
     share_inside : float
         Of all differences, within three standard deviations.
     mean_nees : float
         Over time, of squared differences in units of their covariance; 3 is expected.
-    rotation_body_rad, rotation_sd_rad : dict
-        For each sensor the constant rotation (3,) by which it differs from the trajectory, and its predicted sd.
     passed : bool
     words : str
     """
@@ -356,12 +352,9 @@ class AttitudeComparison:
     time_s: FloatArray
     difference_body_rad: FloatArray
     sd_body_rad: FloatArray
-    rms_rad: float
     mean_body_rad: FloatArray
     share_inside: float
     mean_nees: float
-    rotation_body_rad: dict[str, FloatArray]
-    rotation_sd_rad: dict[str, float]
     passed: bool
     words: str
 
@@ -401,15 +394,15 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
     passed = bool(nees <= chi_square_quantile(confidence, 3) and inside >= LEAST_INSIDE)
     rms, predicted = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (off, sd))
     spread = float(np.sqrt(np.trace(theirs, axis1=1, axis2=2).mean() / 3.0))
-    offsets, allowed = _constant_rotations(history, other, rows, spread)
     words = (
         f"attitude from magnetometer and Sun {'agrees with' if passed else 'contradicts'} the trajectory: "
         f"{np.rad2deg(rms):.2f} deg rms where {np.rad2deg(predicted):.2f} deg is predicted, "
         f"{100.0 * inside:.0f} % inside three standard deviations"
     )
     if not passed:
+        offsets, allowed = _constant_rotations(history, other, rows, spread)
         words += f"; {_inconsistent_sensors(offsets, allowed, confidence)}"
-    return AttitudeComparison(t[rows], off, sd, rms, off.mean(axis=0), inside, nees, offsets, allowed, passed, words)
+    return AttitudeComparison(t[rows], off, sd, off.mean(axis=0), inside, nees, passed, words)
 
 
 def _constant_rotations(

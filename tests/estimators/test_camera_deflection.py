@@ -16,7 +16,7 @@ from estimators.camera_fit import REACH_PX
 from estimators.edge import HorizonLine, find_horizon, steps_near
 from estimators.frame_residuals import light_columns
 from estimators.overlay import Overlay
-from estimators.virtual_camera import VirtualCamera
+from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
@@ -182,10 +182,10 @@ def test_light_moves_an_edge_by_shift_tilt_and_bow_that_do_not_do_for_each_other
 
 
 def test_positive_bending_towards_the_camera_moves_the_edge_up(view):
-    apex = [view.edge_of(D(t), D(MOUNT.clock_lv_deg)).pixels[:, 1].min() for t in (-4.0, 0.0, 4.0)]
+    apex = [view.edge(deformation_of(D(t), D(MOUNT.clock_lv_deg))).pixels[:, 1].min() for t in (-4.0, 0.0, 4.0)]
     assert apex[2] < apex[1] - 15.0 < apex[0] - 30.0
     # towards camera 1 (larger clock, left): the left end of the edge rises against the right one
-    rest, tilted = view.edge_of(0.0, 0.0), view.edge_of(D(4.0), D(225.0))
+    rest, tilted = view.edge(deformation_of(0.0, 0.0)), view.edge(deformation_of(D(4.0), D(225.0)))
     for column, sign in ((100.0, 1.0), (620.0, -1.0)):
         row = [np.interp(column, *e.pixels[np.argsort(e.pixels[:, 0])].T) for e in (rest, tilted)]
         assert sign * (row[0] - row[1]) > 5.0
@@ -366,7 +366,7 @@ def test_found_points_carry_the_sd_their_noise_gives_them(near):
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
     renderer = ShellRenderer(GEOMETRY, camera, JOINT_M)
     radiance = 0.35 * renderer.radiance(0.0, 0.0, sun(330.0))
-    lines = view.lines_at(view.edge_clocks(), np.zeros(3)) if near else view.scan_lines()
+    lines = view.lines_at(view.edge_clocks(), np.zeros(3))
     places, sds = [], []
     for seed in range(20):
         frame = record(radiance, renderer.vignetting, Imaging(noise_sd=4.0), np.random.default_rng(seed))

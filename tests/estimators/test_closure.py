@@ -19,6 +19,7 @@ from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.vehicle import AeroTerms
 from synthetic_flight.simulate import fly, state_from_ecef
 from tests.oracles.plain_balance import axes, relative_rate
+from tests.synthetic_flight.conftest import with_constant_cmq
 
 from .conftest import VEHICLE
 
@@ -75,7 +76,7 @@ def living(cmq=None):
             "inertia_kgm2": ((2.1, 0.1, -0.25), (0.1, 25.0, 0.6), (-0.25, 0.6, 23.0)),
         }
     )
-    aero = VEHICLE.aero if cmq is None else VEHICLE.aero.with_constant_cmq(cmq)
+    aero = VEHICLE.aero if cmq is None else with_constant_cmq(VEHICLE.aero, cmq)
     return replace(VEHICLE, centerbody=body, aero=aero)
 
 
@@ -160,7 +161,7 @@ def test_each_term_of_the_balances_is_alive():
     still = np.zeros_like(pulse.rate_body_radps)
     assert min(largest(rate_body_radps=still)) > 0.05  # centrifugal and gyroscopic
     assert largest(angular_acceleration_body_radps2=still)[1] > 0.5
-    undamped = replace(vehicle, aero=vehicle.aero.with_constant_cmq(0.0))
+    undamped = replace(vehicle, aero=with_constant_cmq(vehicle.aero, 0.0))
     assert np.rad2deg(np.abs(moment_residual(undamped, bent, pulse)).max()) > 0.01
     # the undeflected vehicle's inertia and c.g. instead of the deflected one's
     straight = _small_angle(vehicle, pulse)
@@ -199,7 +200,7 @@ def test_free_rotation_needs_no_offset(spin_radps):
     moving = replace(
         one, rate_body_radps=np.tile(turn, (n, 1)), angular_acceleration_body_radps2=np.tile(turning, (n, 1))
     )
-    model = replace(trim_model(VEHICLE), aero=VEHICLE.aero.with_constant_cmq(0.0), inertia_kgm2=tensor)
+    model = replace(trim_model(VEHICLE), aero=with_constant_cmq(VEHICLE.aero, 0.0), inertia_kgm2=tensor)
     # 1 N m at this pressure is 0.1 mm of offset; differences over 0.1 ms leave 1e-6 of the moments of some N m
     np.testing.assert_allclose(moment_term(model, moving), 0.0, atol=1e-9)
 

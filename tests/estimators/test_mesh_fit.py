@@ -8,7 +8,7 @@ import pytest
 from estimators.benchmark import orient_camera
 from estimators.features import visible_features
 from estimators.texture import surface_seen
-from estimators.virtual_camera import VirtualCamera
+from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.geometry import FEATURE_KINDS, ListedFeatures, bend
 from flightmodel.rendering import render
@@ -26,14 +26,14 @@ def test_the_edge_is_the_border_of_the_mesh_s_picture(theta_deg, plane_deg):
     fine = camera_from_mount(MOUNT).sampled(n)
     deflected = bend(ODD.mesh.vertices_m, D(theta_deg), D(plane_deg), JOINT_M)
     hit = render(fine, deflected, ODD.mesh.faces).is_hit
-    edge = VirtualCamera(ODD, fine, JOINT_M).edge_of(D(theta_deg), D(plane_deg))
+    edge = VirtualCamera(ODD, fine, JOINT_M).edge(deformation_of(D(theta_deg), D(plane_deg)))
     inside = fine.is_inside(edge.pixels, 40.0)
     off = []
     for at, inward in zip(edge.pixels[inside], edge.inward_px[inside], strict=True):
         along = np.arange(-30.0, 30.0, 0.25)
         u, v = np.rint(at + along[:, None] * inward).astype(int).T
         off.append(along[np.argmax(hit[v, u])] / n)
-    tori = VirtualCamera(GEOMETRY, fine, JOINT_M).edge_of(D(theta_deg), D(plane_deg)).pixels
+    tori = VirtualCamera(GEOMETRY, fine, JOINT_M).edge(deformation_of(D(theta_deg), D(plane_deg))).pixels
     assert len(off) > 60
     assert abs(np.mean(off)) < 0.1
     assert np.std(off) < 0.15

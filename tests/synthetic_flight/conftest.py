@@ -108,3 +108,10 @@ def measured(record_property):
         assert value <= limit, f"{what}: {value:.6g} {unit} against {limit:g} {unit}"
 
     return within
+
+
+def with_constant_cmq(aero, cmq):
+    """Copy of coefficients with one of pitch damping everywhere."""
+    changed = aero.coefficients.copy()
+    changed[..., 3] = cmq
+    return replace(aero, coefficients=changed)

@@ -9,7 +9,7 @@ import trimesh
 
 import flightmodel
 from estimators.edge import find_horizon
-from estimators.virtual_camera import VirtualCamera
+from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import ShellGeometry, bend, torus_circles, vehicle_meshes
@@ -63,8 +63,8 @@ def test_ray_cast_edge_equals_the_projected_limb(off_camera, theta_deg, plane_de
     frame = record(renderer.radiance(D(theta_deg), D(plane_deg), sun(sun_deg)), renderer.vignetting,
                    Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
-    found = find_horizon(frame, view.scan_lines(), camera.size_px)
-    residual, _, _ = view.mismatch(found, view.edge_of(D(theta_deg), D(plane_deg)))
+    found = find_horizon(frame, view.lines_at(view.edge_clocks(), np.zeros(3)), camera.size_px)
+    residual, _, _ = view.mismatch(found, view.edge(deformation_of(D(theta_deg), D(plane_deg))))
     assert found.is_usable
     assert np.isfinite(residual).mean() > 0.9
     # shading that changes within the 1.1 px blur moves the half-level crossing by a share of it; unshaded it is 0.02
@@ -78,7 +78,8 @@ def test_without_shading_the_two_edges_agree_to_hundredths_of_a_pixel(off_camera
                    Imaging(noise_sd=0.0), np.random.default_rng(0))  # fmt: skip
     view = VirtualCamera(GEOMETRY, camera, JOINT_M)
     residual, _, _ = view.mismatch(
-        find_horizon(frame, view.scan_lines(), camera.size_px), view.edge_of(D(3.7), D(191.0))
+        find_horizon(frame, view.lines_at(view.edge_clocks(), np.zeros(3)), camera.size_px),
+        view.edge(deformation_of(D(3.7), D(191.0))),
     )
     # one grey level of 178 is 0.015 px; a pixel's box coverage at a slant adds a few hundredths
     assert abs(np.nanmean(residual)) < 0.03
@@ -117,7 +118,7 @@ def test_edge_moves_up_when_the_rim_comes_towards_the_camera(off_camera):
             Imaging(),
             np.random.default_rng(1),
         )
-        rows.append(find_horizon(frame, view.scan_lines(), camera.size_px).lowest_row_px)
+        rows.append(find_horizon(frame, view.lines_at(view.edge_clocks(), np.zeros(3)), camera.size_px).lowest_row_px)
     # rim moves by about 0.84 theta: 4 deg is 18 px at 5.4 px/deg
     np.testing.assert_allclose(np.diff(rows), -18.0, atol=2.5)
 

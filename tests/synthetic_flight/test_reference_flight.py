@@ -9,7 +9,7 @@ from estimators.trim import trim_model
 from flightmodel.atmosphere import standard_atmosphere
 from synthetic_flight.simulate import fly
 
-from .conftest import entry_state
+from .conftest import entry_state, with_constant_cmq
 
 
 def flown(vehicle, frequency_hz, spin_rpm=0.0, damping_share=0.005):
@@ -18,7 +18,7 @@ def flown(vehicle, frequency_hz, spin_rpm=0.0, damping_share=0.005):
     k = (2 * np.pi * frequency_hz) ** 2 * reduced
     c = damping_share * 2 * np.sqrt(k * reduced)
     update = {"bending_stiffness_nmprad": k, "bending_damping_nmsprad": c, "torsion_damping_nmsprad": c}
-    one = replace(vehicle, joint=vehicle.joint.model_copy(update=update), aero=vehicle.aero.with_constant_cmq(-0.1))
+    one = replace(vehicle, joint=vehicle.joint.model_copy(update=update), aero=with_constant_cmq(vehicle.aero, -0.1))
     state = entry_state(one, spin_rpm=spin_rpm)
     return fly(one, standard_atmosphere(), state, 403.1, 460.1, "2009-08-17T12:52:00Z")
 
