@@ -35,6 +35,7 @@ from flightmodel.geometry import ShellGeometry, edge_circles, torus_circles
 from flightmodel.rendering import Rendered, render
 
 _EDGE_POINTS = 201  # over 200 deg, one a degree: chords 0.06 mm off at 1.5 m
+_EDGE_LINES = 240  # across the edge, along which it is looked for
 _OUTER_PX, _INNER_PX = 75.0, 45.0  # 14 deg at 310 px a radian; inwards less, where the shell has other edges
 
 DEFLECTION, FLATTENING, CAMERA, HELD, RADIUS = slice(0, 2), 2, slice(3, 11), slice(11, 16), 14
@@ -203,7 +204,7 @@ class VirtualCamera:
         x = -(station + per * (aft - flattening * outwards))
         return np.column_stack([x, scale * points[:, 1], scale * points[:, 2]])
 
-    def edge_clocks(self, count: int = 240) -> FloatArray:
+    def edge_clocks(self) -> FloatArray:
         """Clocking angles of places spread evenly along the undeflected edge, inside the picture and off its border."""
         edge = self.edge(np.zeros(3))
         inside = np.flatnonzero(self.camera.is_inside(edge.pixels, 6.0))
@@ -213,7 +214,7 @@ class VirtualCamera:
                 "edge-out-of-view",
             )
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge.pixels[inside], axis=0), axis=1))])
-        return np.interp(np.linspace(0.0, length[-1], count), length, edge.clocks_rad[inside])
+        return np.interp(np.linspace(0.0, length[-1], _EDGE_LINES), length, edge.clocks_rad[inside])
 
     def lines_at(self, clocks_rad: FloatArray, deformation: FloatArray) -> ScanLines:
         """Scan lines normal to the edge of a deformation (3,) at clocking angles; those out of the field left out."""

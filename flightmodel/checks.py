@@ -118,10 +118,10 @@ def check_increasing(name: str, time_s: FloatArray) -> None:
         )
 
 
-def check_unit_quaternion(name: str, q: FloatArray, tolerance: float = 1e-6) -> None:
-    """Raise `GateError` where a quaternion's norm differs from one by more than ``tolerance``."""
+def check_unit_quaternion(name: str, q: FloatArray) -> None:
+    """Raise `GateError` where a quaternion's norm differs from one by more than a millionth."""
     off = np.abs(np.linalg.norm(q, axis=-1) - 1.0)
-    if (off > tolerance).any():
+    if (off > 1e-6).any():
         raise GateError(
             f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})", code="not-unit-quaternion"
         )

@@ -32,7 +32,7 @@ from postflight.score import PUBLISHED_DEG, Score, score_run
 from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import return_large_arrays, write_out
-from postflight.studies.preflight import Bounds, rigid_bounds
+from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.terminal import progress_bar, terminal
 from recon.consistency import ConsistencyCheck
 from recon.setup import check_sources
@@ -265,7 +265,7 @@ def _write_rest(
         out.write_csv("camera_sensitivity.csv", camera_sensitivity(bet.flight, answers.histories["camera"]))
     bounds, table = None, None
     if bet.loads is not None:
-        bounds = rigid_bounds(bet, progress=step(0.1, 0.2 if reruns else 0.9))
+        bounds = entry_bounds(bet, None, progress=step(0.1, 0.2 if reruns else 0.9))
         out.write_csv("rigid_bounds.csv", bounds.table())
     if reruns:
         table = sensitivity(bet, step(0.2, 0.9))

@@ -171,7 +171,7 @@ class Settings:
             raise ConfigError(faults)
 
     @classmethod
-    def from_mapping(cls, values: Mapping[str, object], where: str = "[reconstruction]") -> Settings:
+    def from_mapping(cls, values: Mapping[str, object]) -> Settings:
         """Settings from keys and values, as of ``[reconstruction]`` in flight.toml; the rest have their defaults.
 
         Raises
@@ -182,7 +182,7 @@ class Settings:
         names = [setting.name for setting in fields(cls)]
         faults = [
             Fault(
-                f"{where} {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
+                f"[reconstruction] {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
                 "setting-unknown",
             )
             for key in values
@@ -191,7 +191,7 @@ class Settings:
         try:
             chosen = cls(**{key: value for key, value in values.items() if key in names})  # type: ignore[arg-type]
         except ConfigError as wrong:
-            faults += [Fault(f"{where} {fault}", fault.code) for fault in wrong.faults]
+            faults += [Fault(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
         if faults:
             raise ConfigError(faults)
         return chosen

@@ -312,15 +312,13 @@ def design_for(factors: tuple[str, ...], by: str, base: int, seed: int) -> Desig
 RESAMPLES = 999
 
 
-def indices(design: Design, values: FloatArray, seed: int = 0) -> tuple[pd.DataFrame, int]:
+def indices(design: Design, values: FloatArray) -> tuple[pd.DataFrame, int]:
     """First-order and total indices with 95 % bootstrap intervals.
 
     Parameters
     ----------
     values : (flights,) float
         Output of every run, NaN where it failed. A point of the design of which one run failed is left out.
-    seed : int
-        Of the bootstrap.
 
     Returns
     -------
@@ -347,7 +345,7 @@ def indices(design: Design, values: FloatArray, seed: int = 0) -> tuple[pd.DataF
 
     found = bootstrap(
         (np.arange(kept.shape[1]),), lambda rows: _estimate(kept[:, rows]), vectorized=False,
-        n_resamples=RESAMPLES, method="percentile", confidence_level=0.95, rng=np.random.default_rng(seed),
+        n_resamples=RESAMPLES, method="percentile", confidence_level=0.95, rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
     table = pd.DataFrame({"factor": design.names})
     for name, value, low, high in zip(("first", "total"), _estimate(kept), found.low, found.high, strict=True):

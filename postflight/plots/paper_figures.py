@@ -28,7 +28,7 @@ from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
 from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, stamp
 from postflight.reconstruction import Reconstruction
-from postflight.studies.preflight import Bounds, rigid_bounds
+from postflight.studies.preflight import Bounds, entry_bounds
 
 _STIFF_SHOWN = 20.0  # a joint so many times as stiff as wanted is shown; a locked one lies beyond the axis
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
@@ -56,7 +56,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
 
     Without ``bounds`` the rigid vehicle is simulated ``flights`` times from this flight's own state.
     """
-    bounds = bounds or rigid_bounds(flight, flights)
+    bounds = bounds or entry_bounds(flight, None, flights)
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
     air, pulse = flight.air, flight.required_loads()

@@ -16,7 +16,7 @@ M. Okabe, K. Ito, *Color Universal Design*, 2008.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -164,9 +164,9 @@ def percentiles(ax: Axes, time_s: FloatArray, low: FloatArray, middle: FloatArra
     ax.plot(time_s, middle, color=COLOUR["estimate"], label="50 %")
 
 
-def limits(ax: Axes, levels: Iterable[float] = (-3.0, 3.0), *, vertical: bool = False) -> None:
+def limits(ax: Axes, *, vertical: bool = False) -> None:
     """Draw the dotted lines that a ratio to its standard deviation should stay between."""
-    for level in levels:
+    for level in (-3.0, 3.0):
         (ax.axvline if vertical else ax.axhline)(level, color=COLOUR["limit"], lw=0.8, ls=":")
 
 

@@ -50,7 +50,7 @@ from postflight.reconciliation.posterior import (
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
 from postflight.studies.commands import bands, compared_with_bounds
-from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, rigid_bounds, without_fit
+from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from recon.consistency import ConsistencyCheck, consistency_check
@@ -105,7 +105,7 @@ class Reconciliation(Tabular):
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
         report = progress or (lambda _fraction, _what: None)
-        rigid = rigid_bounds(self.bet, flights, progress=lambda f, what: report(0.3 * f, what))
+        rigid = entry_bounds(self.bet, None, flights, progress=lambda f, what: report(0.3 * f, what))
         laws, vehicle = dispersed(self.fit)
         flexible = lambda f, what: report(0.3 + 0.7 * f, what)  # noqa: E731
         return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=flexible, vehicle=vehicle)

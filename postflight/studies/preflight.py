@@ -113,11 +113,6 @@ def dispersions_of(stated: Uncertainty, joint: JointDispersions | None) -> Dispe
     )
 
 
-def rigid_bounds(flight: Reconstruction, flights: int = 100, seed: int = 0, progress: Progress | None = None) -> Bounds:
-    """Fly the rigid vehicle ``flights`` times; run ``k`` is the same flight whatever their number."""
-    return entry_bounds(flight, None, flights, seed, progress)
-
-
 def entry_bounds(
     flight: Reconstruction,
     joint: JointDispersions | None,
@@ -126,7 +121,7 @@ def entry_bounds(
     progress: Progress | None = None,
     vehicle: Vehicle | None = None,
 ) -> Bounds:
-    """Fly the flight's own entry ``flights`` times.
+    """Fly the flight's own entry ``flights`` times; run ``k`` is the same flight whatever their number.
 
     Parameters
     ----------
@@ -242,4 +237,4 @@ def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) 
 
 def without_fit(flight: Reconstruction) -> tuple[DeflectionHistory | None, Bounds]:
     """Fused deflection, and bands of entries with the joint locked."""
-    return estimate(flight, ("fused",)).histories.get("fused"), rigid_bounds(flight, ENTRIES)
+    return estimate(flight, ("fused",)).histories.get("fused"), entry_bounds(flight, None, ENTRIES)

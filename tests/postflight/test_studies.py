@@ -14,7 +14,7 @@ from postflight.flight import read_flight
 from postflight.montecarlo.study import read_study
 from postflight.reconstruction import reconstruct
 from postflight.studies import commands, joints
-from postflight.studies.preflight import dispersions_of, entry_bounds, inside, rigid_bounds
+from postflight.studies.preflight import dispersions_of, entry_bounds, inside
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Window
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs
@@ -115,7 +115,7 @@ def test_the_flight_leaves_rigid_bounds_and_stays_in_flexible_ones(flight, tmp_p
 @pytest.mark.slow
 def test_bounds_are_the_same_flights_whatever_their_number(flight):
     _, reconstructed = flight
-    few, many = rigid_bounds(reconstructed, flights=1), rigid_bounds(reconstructed, flights=20)
+    few, many = entry_bounds(reconstructed, None, flights=1), entry_bounds(reconstructed, None, flights=20)
     np.testing.assert_array_equal(few.nominal_alpha_deg, many.nominal_alpha_deg)
     assert (few.alpha_total_deg[1] >= many.alpha_total_deg[0] - 1.0).all()
     np.testing.assert_array_equal(few.alpha_total_deg[0], few.alpha_total_deg[2])
