@@ -46,7 +46,7 @@ WIDE_SD = {
 
 
 @dataclass(frozen=True)
-class _Miss:
+class Miss:
     """Known place minus smoothed position, along north, east, down there, and how common errors would move it."""
 
     place: KnownPlace
@@ -56,18 +56,19 @@ class _Miss:
 
     @property
     def chi2(self) -> float:
+        """Of the miss by itself."""
         return float(self.residual_m @ np.linalg.solve(self.covariance, self.residual_m))
 
 
-def place_checks(
+def missed_places(
     problem: Problem,
     run: ForwardPass,
     states: States,
     arm_body_m: FloatArray,
     places: tuple[KnownPlace, ...],
     settings: Settings,
-) -> list[ConsistencyCheck]:
-    """One check for each place that is known; one that fails names the error of all sites that would explain it.
+) -> list[Miss]:
+    """By how much a trajectory misses places that are known.
 
     Parameters
     ----------
@@ -80,33 +81,8 @@ def place_checks(
         A time outside the trajectory is compared with its nearer end, less well by the way flown in between.
     settings : Settings
     """
-
     if not places:
         return []
-    misses = _misses(problem, run, states, arm_body_m, places, settings)
-    causes, component = _causes(misses, settings.check_confidence)
-    out = []
-    for miss in misses:
-        away = float(np.linalg.norm(miss.residual_m))
-        symptom = f"the trajectory passes {away:.3g} m from it"
-        most = chi_square_quantile(settings.check_confidence, len(miss.residual_m))
-        good = f"{symptom}, within the uncertainty of both"
-        check = consistency_check(
-            "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes, source=SITES,
-            component=component,
-        )  # fmt: skip
-        out.append(check)
-    return out
-
-
-def _misses(
-    problem: Problem,
-    run: ForwardPass,
-    states: States,
-    arm_body_m: FloatArray,
-    places: tuple[KnownPlace, ...],
-    settings: Settings,
-) -> list[_Miss]:
     planet = problem.motion.planet
     nodes = nearest_index(problem.time_s, np.array([place.time_s for place in places]))
     kept = np.zeros(len(problem.time_s), dtype=bool)
@@ -129,11 +105,28 @@ def _misses(
             if column >= 0:
                 response[name] = ned @ covariance[:3, k] / covariance[k, k]
         spread = ned @ covariance[:3, :3] @ ned.T + np.diag(variance)
-        out.append(_Miss(place, ned @ (known - datum), spread, response))
+        out.append(Miss(place, ned @ (known - datum), spread, response))
     return out
 
 
-def _causes(misses: list[_Miss], confidence: float) -> tuple[str, str]:
+def place_checks(misses: list[Miss], confidence: float) -> list[ConsistencyCheck]:
+    """One check for each place that is known; one that fails names the error of all sites that would explain it."""
+    causes, component = _causes(misses, confidence) if misses else ("", "")
+    out = []
+    for miss in misses:
+        away = float(np.linalg.norm(miss.residual_m))
+        symptom = f"the trajectory passes {away:.3g} m from it"
+        most = chi_square_quantile(confidence, len(miss.residual_m))
+        good = f"{symptom}, within the uncertainty of both"
+        check = consistency_check(
+            "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes, source=SITES,
+            component=component,
+        )  # fmt: skip
+        out.append(check)
+    return out
+
+
+def _causes(misses: list[Miss], confidence: float) -> tuple[str, str]:
     """What would explain all misses, in words, and the likeliest error; the error is empty where no single one does."""
 
     dof = sum(len(miss.residual_m) for miss in misses)
