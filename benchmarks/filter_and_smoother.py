@@ -32,6 +32,7 @@ from recon.ekf import Problem, observe
 from recon.measurements import radar_instrument
 from recon.propagation import strapdown_motion
 from recon.state import ErrorModel, States, imu_blocks, instrument_blocks
+from tests.oracles.plain_rotations import matrix, skew
 
 DEG = np.pi / 180.0
 IMU_HZ, RADAR_HZ = 400.0, 10.0
@@ -153,24 +154,6 @@ def turned(q, d):
     )
 
 
-def matrix(q):
-    """Direction cosines of a quaternion."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def cross_matrix(d):
-    """Matrix of a cross product."""
-    x, y, z = d.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def gravity(p):
     """J2 gravitation and the central part of its gradient."""
     x, y, z = p.tolist()
@@ -213,9 +196,9 @@ def with_filterpy(motion, node, start, z):
         full[0:3, 3:6] = dt * eye[:3, :3]
         full[3:6, 0:3] = dt * gradient
         full[3:6, 3:6] -= 2.0 * dt * spin
-        full[3:6, 6:9] = -dt * c @ cross_matrix(f)
+        full[3:6, 6:9] = -dt * c @ skew(f)
         full[3:6, 9:12], full[3:6, 12:15] = -dt * c, -dt * c * f
-        full[6:9, 6:9] -= dt * cross_matrix(w)
+        full[6:9, 6:9] -= dt * skew(w)
         full[range(6, 9), range(15, 18)], full[range(6, 9), range(18, 21)] = -dt, -dt * w
         filt.F, filt.Q = full, idle
         filt.predict()

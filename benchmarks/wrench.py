@@ -14,6 +14,7 @@ from flightmodel import earth
 from flightmodel.checks import FloatArray
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import simulate
+from tests.oracles.plain_rotations import matrix
 
 
 @dataclass(frozen=True)
@@ -113,16 +114,6 @@ def numpy_wrench(c: Constants):
     start, per_step, per_alpha = (float(x) for x in c.grid)
     knots, table, air, free = c.mach, c.coefficients, c.air, c.free
 
-    def matrix(q):
-        w, x, y, z = q.tolist()
-        return np.array(
-            [
-                [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-                [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-                [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-            ]
-        )
-
     def gravity(p):
         r2 = float(p @ p)
         k, s = 1.5 * j2 * a * a / r2, 5.0 * float(p[2]) ** 2 / r2
@@ -130,7 +121,7 @@ def numpy_wrench(c: Constants):
         return (-gm / (r2 * math.sqrt(r2))) * p * np.array([lateral, lateral, 1.0 + k * (3.0 - s)])
 
     def wrench(qpos, qvel, out):
-        r = matrix(qpos[3:7])
+        r = matrix(qpos[3:7].tolist())
         nose = qpos[:3]
         x, y, z = nose.tolist()
         axis = math.hypot(x, y)
@@ -175,6 +166,6 @@ def numpy_wrench(c: Constants):
         ]
         out[1, :3] = mass_a * gravity(nose + r @ cg_a) + r @ np.array([fx, fy, fz])
         out[1, 3:] = r @ np.array(moment)
-        out[2, :3] = mass_b * gravity(nose + r @ (joint + matrix(qpos[7:11]) @ cg_b))
+        out[2, :3] = mass_b * gravity(nose + r @ (joint + matrix(qpos[7:11].tolist()) @ cg_b))
 
     return wrench

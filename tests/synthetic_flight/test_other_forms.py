@@ -19,6 +19,7 @@ from flightmodel.vehicle import MassProperties
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate
 from tests.oracles import two_body
+from tests.oracles.plain_rotations import matrix, skew
 
 from .conftest import bent_entry_state, with_joint
 from .plain_loads import Aerodynamics, JointLaw, SmoothAir, gravitation
@@ -28,21 +29,6 @@ AIR = SmoothAir()
 
 def cross(a, b):
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-def skew(a):
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-
-
-def matrix(q):
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def spin(q, w):
