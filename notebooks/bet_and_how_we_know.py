@@ -104,6 +104,8 @@ for k, what in enumerate(("position", "velocity", "attitude")):
     axes[k].plot(true.time_s, normalised[:, 3 * k : 3 * k + 3])
     axes[k].axhspan(-3, 3, color="0.9", zorder=0)
     axes[k].set_ylabel(f"{what} error / sd")
+axes[0].legend(["x", "y", "z"], ncols=3)
+axes[2].set_xlabel("time after launch, s")
 share = np.mean(np.abs(normalised) < 3.0, axis=0)
 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(mine.covariance), error)
 print(f"inside 3 sd: {share.min():.2f} of the time at least; mean squared error over covariance {squared.mean():.1f} "

@@ -37,15 +37,17 @@ truth
 
 # %%
 figure, axes = plt.subplots(3, 1, sharex=True, figsize=(9, 6))
-for axis, column, label in zip(
+entry = flown[flown["t_s"].between(400, 470)]
+for axis, column, unit, label in zip(
     axes,
     ("altitude_m", "dynamic_pressure_pa", "theta_deg"),
-    ("altitude, m", "dynamic pressure, Pa", "deflection, deg"),
+    (1e3, 1.0, 1.0),
+    ("altitude, km", "dynamic pressure, Pa", "deflection, deg"),
     strict=True,
 ):
-    axis.plot(flown["t_s"], flown[column])
+    axis.plot(entry["t_s"], entry[column] / unit)
     axis.set_ylabel(label)
-axes[2].set(xlabel="time after launch, s", xlim=(400, 470))
+axes[2].set(xlabel="time after launch, s")
 peak = flown.loc[flown["dynamic_pressure_pa"].idxmax()]
 print(
     f"{peak.dynamic_pressure_pa:.0f} Pa at {peak.t_s:.2f} s, Mach {peak.mach:.2f}; deflection {peak.theta_deg:.2f} deg"

@@ -44,10 +44,11 @@ answer = pf.fuse(bet)
 figure, axis = plt.subplots(figsize=(9, 4))
 for method, history in answer.histories.items():
     table = history.to_frame()
+    table = table[table["t_s"].between(425, 452)]
     axis.plot(table["t_s"], table["theta_deg"], label=method)
     low, high = (table["theta_deg"] + sign * table["theta_sd_deg"] for sign in (-1, 1))
     axis.fill_between(table["t_s"], low, high, alpha=0.2)
-axis.set(xlim=(425, 452), xlabel="time after launch, s", ylabel="deflection, deg (band: 1 sd)")
+axis.set(xlabel="time after launch, s", ylabel="deflection, deg (band: 1 sd)")
 axis.legend()
 answer
 

@@ -28,7 +28,7 @@ def test_pair_is_in_step_and_without_outputs(script):
 
 
 @pytest.mark.parametrize("script", NOTEBOOKS, ids=lambda p: p.stem)
-def test_essay_ends_in_what_it_proved(script):
+def test_notebook_ends_in_what_it_proved(script):
     if script.stem != "one_flight":  # whose last section is the truth; its claim stands before
         last = script.read_text().rpartition("# %% [markdown]")[2]
         assert "assert " in last
