@@ -13,7 +13,7 @@ from flightmodel.checks import DivergenceError
 from postflight.fusing import fuse_flight
 
 PLANTED_S = (0.0, 0.05, 0.2, -0.05, -0.2)
-TOLD_SD_S = 0.3
+STATED_SD_S = 0.3
 
 
 def found_clock(seed, folder, late_s, camera_sd_rad):
@@ -26,7 +26,7 @@ def found_clock(seed, folder, late_s, camera_sd_rad):
     seen = dispersed.columns(told_s - late_s, pulse.time_s, truth["theta_yz"])
     camera = dispersed.camera_history(np.random.default_rng([seed, 7, 2009]), seen, told_s, camera_sd_rad)
     try:
-        clock = fuse_flight(pulse, camera, camera_time_bias_sd_s=TOLD_SD_S).camera_time_bias
+        clock = fuse_flight(pulse, camera, camera_time_bias_sd_s=STATED_SD_S).camera_time_bias
     except DivergenceError as fault:
         print(f"flight {seed}: {fault}")
         return None

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from benchmarks.reconciliation import TOLD, flown_vehicle
+from benchmarks.reconciliation import STATED, flown_vehicle
 from estimators.benchmark import RelativeDeflections, benchmark_deflection, joint_moment
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from flightmodel.checks import GateError
@@ -114,7 +114,7 @@ def friction_rows(loads, seed):
     """The same with dry friction of the article's size on the flight's own moment."""
     moment = joint_moment(loads).value_nm
     kept = slipped(moment, FRICTION_AT * np.linalg.norm(moment, axis=1).max())
-    theta = ((1.0 - FRICTION_SHARE) * moment + FRICTION_SHARE * kept) / TOLD.joint.bending_stiffness_nmprad
+    theta = ((1.0 - FRICTION_SHARE) * moment + FRICTION_SHARE * kept) / STATED.joint.bending_stiffness_nmprad
     return benchmark_rows(loads, theta, loads.time_s, seed)
 
 

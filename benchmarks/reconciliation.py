@@ -39,7 +39,7 @@ from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
 from tests.wide_flights import flown, wide_flight
 
-TOLD = vehicle_from_toml(vehicle_path("irve2_reference"))
+STATED = vehicle_from_toml(vehicle_path("irve2_reference"))
 AT_RAD = np.deg2rad(4.0)
 SURE, FELT_SD = 3.0, 3.0  # odds of twenty to one; an effect that must be recognised
 
@@ -47,14 +47,14 @@ SURE, FELT_SD = 3.0, 3.0  # odds of twenty to one; an effect that must be recogn
 def flown_vehicle(seed, hardening=0.0, freeplay_deg=0.0):
     """Vehicle as it is."""
     rng = np.random.default_rng([seed, 7, 2009])
-    vehicle = dispersed.dispersed_vehicle(TOLD, rng)
-    body, known = vehicle.centerbody, TOLD.uncertainty
+    vehicle = dispersed.dispersed_vehicle(STATED, rng)
+    body, known = vehicle.centerbody, STATED.uncertainty
     clock, size = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.002, 0.005)
     lateral = size * vehicle.mass_kg / body.mass_kg * np.array([-np.cos(clock), np.sin(clock)])
     moved = body.model_copy(update={"cg_from_datum_body_m": (body.cg_from_datum_body_m[0], *map(float, lateral))})
     factors = {k: 1.0 + getattr(known, k) * rng.standard_normal() for k in ("ca", "cn", "cm")}
     aero = vehicle.aero.scaled(**factors, cmq_shift=known.cmq * rng.standard_normal())
-    stiffness = TOLD.joint.bending_stiffness_nmprad * rng.uniform(1.0, 1.5)
+    stiffness = STATED.joint.bending_stiffness_nmprad * rng.uniform(1.0, 1.5)
     ratio = 0.005 * np.exp(0.5 * rng.standard_normal())
     changed = {
         "bending_stiffness_nmprad": float(stiffness),

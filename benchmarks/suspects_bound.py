@@ -1,4 +1,4 @@
-"""How well can a wrong assumption be told at all? The best decision among the planted errors, on readings as modelled.
+"""How well can a wrong assumption be detected? The best decision among the planted errors, on readings as modelled.
 
 Run: ``python benchmarks/suspects_bound.py [FLIGHTS [FIRST SEED]] [FOLDER]`` (flights that ``estimator_coverage.py``
 keeps; constants of the tests are from seeds 0 to 29). Readings bear on an error through ``u = D' m`` alone
@@ -27,7 +27,7 @@ SIDES = {  # of what `estimator_coverage.planted` plants, in columns of the faul
 }
 
 
-def told_apart(seed, folder):
+def separation(seed, folder):
     """``D' V D`` of a flight as the reference vehicle's analyst has it, all suspects' columns in order of `SIDES`."""
     pulse, truth = kept_flight(folder, seed)
     known = vehicle_from_toml(vehicle_path("irve2_reference")).uncertainty
@@ -44,9 +44,9 @@ def likelihoods(u, inner, places):
     """Log likelihood of each suspect's error against none ``(draws, suspects)``."""
     out = []
     for at in places:
-        told = np.eye(at.stop - at.start) + inner[at, at]
-        square = np.einsum("ni,ij,nj->n", u[:, at], np.linalg.inv(told), u[:, at])
-        out.append(0.5 * square - 0.5 * np.linalg.slogdet(told)[1])
+        spread = np.eye(at.stop - at.start) + inner[at, at]
+        square = np.einsum("ni,ij,nj->n", u[:, at], np.linalg.inv(spread), u[:, at])
+        out.append(0.5 * square - 0.5 * np.linalg.slogdet(spread)[1])
     return np.stack(out, axis=-1)
 
 
@@ -58,16 +58,16 @@ def main():
     errors = np.zeros((1 + len(SIDES), ends[-1]))
     for k, (at, side) in enumerate(zip(places, SIDES.values(), strict=True), 1):
         errors[k, at] = side
-    rng, told, sizes = np.random.default_rng(2009), [], []
+    rng, scored, sizes = np.random.default_rng(2009), [], []
     for k, seed in enumerate(seeds, 1):
-        inner = told_apart(seed, folder)
+        inner = separation(seed, folder)
         value, axes = np.linalg.eigh(inner)
         noise = rng.standard_normal((DRAWS, len(inner))) @ (axes * np.sqrt(np.maximum(value, 0.0))).T
-        told.append([likelihoods(noise + inner @ error, inner, places) for error in errors])
+        scored.append([likelihoods(noise + inner @ error, inner, places) for error in errors])
         sizes.append(np.sqrt(np.einsum("ki,ij,kj->k", errors[1:], inner, errors[1:])))
         if k % 10 == 0:
             print(f"{k} of {len(seeds)}", flush=True)
-    scores = np.concatenate(told, axis=1)  # (planted, flights and draws, suspects)
+    scores = np.concatenate(scored, axis=1)  # (planted, flights and draws, suspects)
     for share in FALSE_ALARMS:
         limit = np.quantile(scores[0].max(axis=1), 1.0 - share)
         print(f"{100 * share:.0f} % false alarms, odds of {np.exp(limit):.1f} to one:")

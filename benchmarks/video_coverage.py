@@ -2,15 +2,15 @@
 
     python benchmarks/video_coverage.py [KIND] [flights] [first seed]
 
-Every flight has a camera, a light and bendings of its own; its benchmark frame is bent by 0.12 deg an axis that nobody
-is told. Kinds: ``clean``: a lens known to a data sheet's tolerances. ``unbent``: the same with a benchmark that is
-truly not bent, which shows what pictures alone leave. ``degraded``: a lens nobody calibrated, the Earth behind the rim,
-interlace, noise, compression, a shell out of shape (tests/estimators/test_degraded_video.py).
+Every flight has a camera, a light and deflections of its own; its benchmark frame is deflected by 0.12 deg an axis,
+which is not stated. Kinds: ``clean``: a lens known to a data sheet's tolerances. ``unbent``: the same with a benchmark
+truly undeflected, which shows what pictures alone leave. ``degraded``: a lens nobody calibrated, the Earth behind the
+rim, interlace, noise, compression, a shell out of shape (tests/estimators/test_degraded_video.py).
 
 Nothing moved the shell in these. ``flown``: films, a frame a second from 421 to 448 s, of the dispersed flights of
 ``estimator_coverage.py`` (kept in its folder, or flown now), as clean. ``flown-degraded``: as degraded, out of shape in
 proportion to the pressure, moving between two fields as it flew. Scored is the frame nearest to peak pressure, with the
-benchmark taken as not bent, and with its bending told by the joint's moment.
+benchmark taken as undeflected, and with its deflection estimated from the joint's moment.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def flown_film(seed: int, kind: str) -> tuple[list[np.ndarray], Scene]:
 
 
 def one_flown(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]:
-    """Errors and sd at the frame nearest to peak pressure, benchmark not bent and told; then the benchmark's own."""
+    """Errors and sd of the frame nearest to peak pressure, benchmark undeflected and estimated; the benchmark's own."""
     kind, seed = job
     cv2.setNumThreads(1)
     pulse, truth = dispersed.kept_flight(dispersed.KEPT, seed)
@@ -108,16 +108,16 @@ def one_flown(job: tuple[str, int]) -> tuple[int, list[tuple[float, ...]], str]:
     k = int(np.argmin(np.abs(FLOWN_S - truth["peak"])))
     try:
         read = read_film(FLOWN_S, frames, GEOMETRY, mount, JOINT_M, plane_lv_rad=None)
-        told = benchmark_deflection(read.relative_to_benchmark(), pulse, read.oriented.apriori.benchmark_rad)
+        rest = benchmark_deflection(read.relative_to_benchmark(), pulse, read.oriented.apriori.benchmark_rad)
     except GateError as fault:
         return seed, [], str(fault)
     rows = []
-    for history in (read.history(), read.history(told)):
+    for history in (read.history(), read.history(rest)):
         off = np.angle(np.exp(1j * (history.plane_lv_rad[k] - scene.plane_lv_rad[k])))
         sd = np.sqrt(np.diag(history.covariance[k]))
         rows.append(tuple(np.rad2deg([history.theta_rad[k] - scene.theta_rad[k], off, *sd]).tolist()))
-    bent = dispersed.columns(FLOWN_S[:1], pulse.time_s, truth["theta_yz"])[0]
-    own = np.rad2deg([*bent, *(told.theta_yz_rad - bent), *np.sqrt(np.diag(told.covariance))])
+    there = dispersed.columns(FLOWN_S[:1], pulse.time_s, truth["theta_yz"])[0]
+    own = np.rad2deg([*there, *(rest.theta_yz_rad - there), *np.sqrt(np.diag(rest.covariance))])
     return seed, [*rows, tuple(own.tolist())], ""
 
 
@@ -126,7 +126,7 @@ def report(name: str, table: np.ndarray) -> None:
     error, sd = table.T
     cover = [100.0 * np.mean(np.abs(error) < k * sd) for k in (1, 2)]
     print(f"  {name}: rms {np.sqrt(np.mean(error**2)):.3f} deg, bias {error.mean():+.3f}, largest "
-          f"{np.abs(error).max():.2f}; said {np.sqrt(np.mean(sd**2)):.3f}; 1 sd covers {cover[0]:.0f} %, "
+          f"{np.abs(error).max():.2f}; stated {np.sqrt(np.mean(sd**2)):.3f}; 1 sd covers {cover[0]:.0f} %, "
           f"2 sd {cover[1]:.0f} %")  # fmt: skip
 
 
@@ -144,9 +144,9 @@ def main_flown(kind: str, flights: int, first: int) -> None:
                 found.append(rows)
     print(f"{kind}: {len(found)} films")
     own = np.array([rows[2] for rows in found])
-    print(f"  benchmark: bent by {np.sqrt(np.mean(own[:, :2] ** 2)):.3f} deg rms an axis")
+    print(f"  benchmark: deflected by {np.sqrt(np.mean(own[:, :2] ** 2)):.3f} deg rms an axis")
     report("benchmark, an axis", own[:, 2:].reshape(-1, 2, 2).transpose(0, 2, 1).reshape(-1, 2))
-    for k, name in enumerate(("taken as not bent", "told by the joint")):
+    for k, name in enumerate(("taken as undeflected", "by the joint's moment")):
         table = np.array([rows[k] for rows in found])
         report(f"angle, {name}", table[:, [0, 2]])
         report(f"plane, {name}", table[:, [1, 3]])

@@ -305,7 +305,7 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         if law not in odds:
             continue
         side = "for" if odds[law] > 0.0 else "against"
-        open_words = "cannot be told" if law == "creep" else "no clear evidence"
+        open_words = "not determined" if law == "creep" else "no clear evidence"
         evidence = open_words if abs(odds[law]) < STRONG else f"strong evidence {side}"
         console.print(f"{name}: {evidence} (odds e^{odds[law]:+.1f})")
     if odds.get("hardening", 0.0) > STRONG and "hardening" not in fit.problem.vehicle_parameters.laws:

@@ -34,9 +34,9 @@ needs_data = [
 ]
 # what an analyst wrote down of a flight's traps, taken out again
 ALL_TIMES = (r"(?m)^use_s = .*\n", "")
-THRUST_UNTOLD = (r"(?m)^powered_s.*\n", "")
+THRUST_UNSTATED = (r"(?m)^powered_s.*\n", "")
 DRAG = "drag_area_per_mass_m2pkg = {:.9f}"
-DISTURBED_UNTOLD = (r"(?m)^\[\[motion\.disturbed\]\]\n(.+\n){3}", "")
+DISTURBED_UNSTATED = (r"(?m)^\[\[motion\.disturbed\]\]\n(.+\n){3}", "")
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ class TestPrometheus:
 
     def test_nothing_told_of_thrust_drogue_and_landing(self, fly):
         """What powered_s and use_s told is found from the track, and the flight between comes out the same."""
-        raw = fly("rocketpy_prometheus", ALL_TIMES, THRUST_UNTOLD)
+        raw = fly("rocketpy_prometheus", ALL_TIMES, THRUST_UNSTATED)
         found = disturbances(raw)
         assert some_overlap(found, 0.0, 6.0)
         assert some_overlap(found, 28.4, 36.0)
@@ -201,7 +201,7 @@ class TestBlackBrant:
 
     def test_nothing_told_of_echoes_gaps_and_loss(self, fly):
         """Thrust behind a minute's gap, points that settle, echoes before landing, loss: found, the coast unharmed."""
-        told, raw = fly("radar_36353"), fly("radar_36353", ALL_TIMES, DISTURBED_UNTOLD)
+        told, raw = fly("radar_36353"), fly("radar_36353", ALL_TIMES, DISTURBED_UNSTATED)
         found = disturbances(raw)
         assert some_overlap(found, 1.65, 60.7)
         assert not some_overlap(found, 100.0, 650.0)

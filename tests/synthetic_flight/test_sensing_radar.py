@@ -237,7 +237,7 @@ def test_errors_of_a_range_rate_that_is_not_measured_are_refused():
         radar(range_rate_wander_mps=0.2)
 
 
-def test_datum_and_cg_are_told_apart(truth):
+def test_datum_and_cg_are_separated(truth):
     """The nose is half a metre ahead: the ranges differ by the lever arm's part along the line of sight."""
     at, cg = sensed(truth)
     _, nose = sensed(truth, tracks="datum")

@@ -126,7 +126,7 @@ def test_heights_above_the_geoid_are_named(run, other):
     np.testing.assert_allclose(effects["shift"].value, [0.0, 0.0, -0.4], atol=0.05)
 
 
-def test_two_at_once_are_told_apart(run, other):
+def test_two_at_once_are_separated(run, other):
     effects = {effect.name: effect for effect in found(run, inertial(late(turned_body(other)))).effects}
     assert set(effects) == {"inertial-velocity", "time-offset", "attitude-body"}
     assert effects["time-offset"].value[0] == pytest.approx(20.0, abs=1.0)
