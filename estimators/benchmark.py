@@ -51,7 +51,15 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import softmax
 
 from estimators.camera_fit import USUAL_SHARE, Image, OrientedCamera
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines, breaks_across, fault_of_frame, is_coherent
+from estimators.edge import (
+    NO_FAULT,
+    HorizonLine,
+    ScanLines,
+    breaks_across,
+    fault_of_frame,
+    is_coherent,
+    steepness_of,
+)
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.features import Features, ImageFeatures, fit_feature_map, no_features, valleys, visible_features
 from estimators.frame_checks import USUAL_RMS_PX
@@ -317,7 +325,7 @@ def _fitted(
     return OrientedCamera(
         look.view, look.clocks_rad, look.lines, features, apriori, look.horizon, look.residuals, pose[:8],
         formal[:_POSES, :_POSES], per_deflection, rms, support=_share_found(look, features),
-        breaks=breaks_across(benchmark.image),
+        breaks=breaks_across(benchmark.image), steepness=steepness_of(benchmark.image, look.horizon),
     )  # fmt: skip
 
 

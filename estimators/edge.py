@@ -71,6 +71,7 @@ _NEAREST_PX, _FARTHEST_PX = 2.0, 24.0  # nearer is one edge, blurred; farther in
 _LEAST_STEP, _OF_SCATTER = 0.05, 3.0  # of the first edge's step; of the scatter of what is no step
 _ENOUGH_POINTS, _LEAST_POINTS, _LEAST_PART = 120, 30, 0.3  # looked at; that a turn moves far enough, and of all
 _DOUBLED, _BEYOND_RING = 0.55, 0.2  # a turn shares some of a ring's points, where it moves them as far
+_ACROSS_PX = 2.0  # on either side of an edge's middle: more of the shell has shades of its own
 
 
 @dataclass(frozen=True)
@@ -360,6 +361,29 @@ EDGE_BASES = _edge_bases(EDGE_PLACES, np.linspace(-STEP_PX * EDGE_HALF, STEP_PX 
 NEAR_ALONG: FloatArray = np.linspace(-_NEAR_PX, _NEAR_PX, round(2.0 * _NEAR_PX / STEP_PX) + 1)
 NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
 NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)
+
+
+def steepness_of(image: Image, horizon: HorizonLine) -> float:
+    """How sharp is the edge: the grey levels' rise over its middle pixel, as a share of that over 4 px.
+
+    Of all points together, so that noise has little part in it: a third of a sharp step after the smoothing, a quarter
+    of one that is wider than what is looked at. NaN of too few points.
+
+    Parameters
+    ----------
+    image : (h, w) uint8
+    horizon : HorizonLine
+    """
+    lines = ScanLines(horizon.points_px, horizon.inward_px, _ACROSS_PX, _ACROSS_PX, horizon.line)
+    if len(horizon.points_px) < _LEAST_POINTS:
+        return float("nan")
+    grey, inside = sampled(image, lines, round(2.0 * _ACROSS_PX / STEP_PX) + 1)
+    levels = grey[inside.all(axis=1)]
+    if len(levels) < _LEAST_POINTS:
+        return float("nan")
+    whole = levels[:, -1] - levels[:, 0]
+    middle, half = levels.shape[1] // 2, round(0.5 / STEP_PX)
+    return float(np.sign(whole) @ (levels[:, middle + half] - levels[:, middle - half]) / np.abs(whole).sum())
 
 
 def fault_of_second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray) -> Fault:

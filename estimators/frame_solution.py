@@ -237,6 +237,8 @@ class FrameModel:
         frame shows.
     breaks : (m,) int
         Rows after which the benchmark frame breaks across its width.
+    steepness : float
+        Of the benchmark frame's edge; see `estimators.edge.steepness_of`.
     """
 
     view: VirtualCamera
@@ -253,6 +255,7 @@ class FrameModel:
     stated_refused: Fault = NO_FAULT
     support: float = 1.0
     breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
+    steepness: float = float("nan")
 
     @cached_property
     def _benchmark_edge(self) -> BoolArray:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from estimators import benchmark
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_doubtful
+from estimators.edge import WHOLE_BLUR_PX, HorizonLine, steepness_of
 from estimators.features import valleys, visible_features
 from estimators.frame_checks import Design, fault_of_fit
 from estimators.frame_edits import EditedFrame
@@ -54,6 +56,36 @@ def test_a_frame_that_needs_more_than_a_deflection_is_no_answer(frames):
     assert not oriented.fit(frames[1]).refused
     assert not oriented.fit(frames[2]).refused
     assert oriented.fit(twisted).refused.code in CONTRADICTS
+
+
+def test_a_frame_out_of_focus_is_refused_and_a_film_that_always_was_is_not():
+    """By its edge alone: the sun's side of the rim and its shaded side move apart as the edge widens."""
+    plain = GEOMETRY.model_copy(update={"features": "none"})
+    frames = film(6, [0.0, 1.0, 3.6], [0.0, 188.0, 160.0])
+    wide = [cv2.GaussianBlur(frame, (0, 0), 5.0) for frame in frames]
+    sharp = orient_camera(frames[0], plain, MOUNT, JOINT_M)
+    assert not sharp.fit(cv2.GaussianBlur(frames[1], (0, 0), 1.0)).refused
+    assert [sharp.fit(frame).refused.code for frame in wide[1:]] == ["edge-blurred"] * 2
+    # and where the benchmark frame is the one that is out of focus
+    soft = cv2.GaussianBlur(frames[0], (0, 0), 2.0)
+    by_soft = orient_camera(soft, plain, MOUNT, JOINT_M)
+    assert not by_soft.fit(cv2.GaussianBlur(frames[1], (0, 0), 2.0)).refused
+    assert by_soft.steepness < sharp.steepness
+
+
+def test_steepness_of_a_wide_edge_is_that_of_a_ramp():
+    """A step blurred by s px, read half a pixel beside its middle between two pixels, and on pixels 2 px beside it."""
+    across = np.arange(80.0) - 40.0
+    for wide in (1.0, 2.5, 12.0):
+        picture = np.tile(np.rint(20.0 + 200.0 * ndtr(across / wide)).astype(np.uint8)[:, None], (1, 120))
+        line = np.arange(100)
+        edge = HorizonLine(
+            np.column_stack([10.0 + line, np.full(100, 40.0)]), np.tile([0.0, 1.0], (100, 1)), np.ones(100), line
+        )
+        whole = np.hypot(wide, np.sqrt(WHOLE_BLUR_PX**2 - 1.0))  # with the search's own smoothing
+        expected = 0.5 * (ndtr(1.0 / whole) - 0.5) / (ndtr(2.0 / whole) - 0.5)
+        assert steepness_of(picture, edge) == pytest.approx(expected, abs=0.01)
+    assert np.isnan(steepness_of(picture, edge.some(line < 5)))
 
 
 @pytest.mark.parametrize("zoom", [1.03, 1.08])
