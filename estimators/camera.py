@@ -319,7 +319,7 @@ def read_film(
     fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
     remarks = [f"by hand: {edits}"] if edits.rows else []
     if fixed is not None:
-        remarks.append(f"text burnt into the film: {100.0 * fixed.mean():.0f} % of the picture left out")
+        remarks.append(f"text burnt into the film, or dead lines: {100.0 * fixed.mean():.0f} % of the picture left out")
     return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, "; ".join(remarks))
 
 

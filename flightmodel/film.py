@@ -9,9 +9,8 @@ How far and how wide an edge or a feature is looked for, and how far it may lie 
 films of 140 to 410 px a radian, as measured. Pictures of a finer camera are reduced to such a size (`working_camera`):
 with 830 px a radian the same films err by 0.02 deg as read at 310, and as they are lose the edge at large deflections.
 
-Where is text burnt into a film: a time code, a title?
-
-What is written over a picture stays where it is and as bright as it is, whatever the vehicle and its light do. Taken
+Text burnt into a film (`burnt_in`), a time code or a title, and dead lines of a detector are not looked at. What is
+written over a picture stays where it is and as bright as it is, whatever the vehicle and its light do. Taken
 for paint, it would say that the shell did not move. Over frames spread along the film a pixel of it
 
 - keeps its grey level: in four of five frames it lies within `_STEADY` of the median, and
@@ -20,7 +19,10 @@ for paint, it would say that the shell did not move. Over frames spread along th
 Digits that change do neither: a group of steady pixels as tall as a line of text is widened along its row by
 `_BESIDE_HEIGHTS` of its height to both sides. Other groups are what is fixed to the camera, and left out as they are.
 
-Assumed: the picture moves, or its light changes. Where most of what stands out is steady, nothing is taken for text.
+Rows and columns that keep their levels where what is around them does not are left out in any case.
+
+Assumed: the picture moves, or its light changes. Where most of what else stands out is steady, nothing is taken for
+text.
 """
 
 from __future__ import annotations
@@ -62,6 +64,9 @@ _JOINED_PX = 9  # between strokes and letters of a line
 _TALLEST = 0.15  # of the picture's height: a line of text
 _BESIDE_HEIGHTS = 4.0
 _MOST_STEADY = 0.8  # of what stands out in a frame
+# of a row's or column's pixels: steady ones, by chance a third, among those whose surroundings are not, which are at
+# least so many; as far as a patch of texture reaches
+_LINE, _LINE_SEEN, _AROUND_PX, _LINE_BESIDE_PX = 0.8, 0.1, 9, 8
 _LEAST_FRAMES = 5
 
 
@@ -299,13 +304,28 @@ def burnt_in(pictures: Sequence[NDArray[np.uint8]]) -> BoolArray | None:
     if len(film) < _LEAST_FRAMES:
         return None
     middle = np.sort(film, axis=0)[len(film) // 2]
-    steady = _slope(middle) > _SHARP
-    off = np.abs(film[:, steady].astype(np.int16) - middle[steady])
-    steady[steady] = np.sort(off, axis=0)[(4 * len(film)) // 5 - 1] <= _STEADY
-    if steady.sum() > _MOST_STEADY * np.sum(_slope(film[len(film) // 2]) > _SHARP):
-        return None
-    out = _groups(steady)
+    swing = np.sort(np.abs(film.astype(np.int16) - middle), axis=0)[(4 * len(film)) // 5 - 1]
+    out = _dead_lines(swing)
+    steady = (_slope(middle) > _SHARP) & (swing <= _STEADY) & ~out
+    if steady.sum() <= _MOST_STEADY * np.sum((_slope(film[len(film) // 2]) > _SHARP) & ~out):
+        out |= _groups(steady)
     return out if out.any() else None
+
+
+def _dead_lines(swing: NDArray[np.int16]) -> BoolArray:
+    """Rows and columns (h, w) that keep their grey levels, where what is around them does not, with what is beside."""
+    out = np.zeros(swing.shape, dtype=np.bool_)
+    brush = np.ones(2 * _LINE_BESIDE_PX + 1)
+    for along, across in ((0, 1), (1, 0)):
+        side = np.ones((1, _AROUND_PX) if across else (_AROUND_PX, 1))
+        # on both sides: sky beside a rim that moves is steady too
+        before, after = (cv2.dilate(swing, side, anchor=(k, 0) if across else (0, k)) for k in (0, _AROUND_PX - 1))
+        lively = np.minimum(before, after) > 3 * _STEADY
+        count = lively.sum(axis=along)
+        kept = np.sum(lively & (swing <= _STEADY), axis=along)
+        dead = (count > _LINE_SEEN * swing.shape[along]) & (kept > _LINE * count)
+        np.moveaxis(out, across, 0)[np.convolve(dead, brush, "same") > 0.0] = True
+    return out
 
 
 def _slope(picture: NDArray[np.uint8]) -> NDArray[np.float32]:

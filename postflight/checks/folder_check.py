@@ -388,6 +388,7 @@ def text_in_films(found: Sources) -> list[Finding]:
     for name, frames in found.films.items():
         hidden = frames.burnt_in
         if hidden is not None:
-            words = f"text is burnt into the film: {100.0 * np.mean(hidden):.0f} % of the picture is left out"
+            share = f"{100.0 * np.mean(hidden):.0f} % of the picture"
+            words = f"text burnt into the film, or dead lines of its detector: {share} is left out"
             out.append(Finding(name, words, float(frames.time_s[0]), float(frames.time_s[-1]), code="text-burnt-in"))
     return out

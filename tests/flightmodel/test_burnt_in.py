@@ -60,6 +60,19 @@ def test_what_moves_is_no_text_and_what_rests_is_not_told_from_it():
     assert burnt_in([]) is None
 
 
+def test_dead_rows_and_columns_are_left_out():
+    """Also where they hardly stand out, and where most of what is steady and sharp is theirs."""
+    columns, row = np.arange(20, WIDTH, 53), 77
+    pictures = cloth(9)
+    for picture in pictures:
+        picture[:, columns] = np.linspace(60, 255, len(columns))
+        picture[row] = 120
+    found = burnt_in(pictures)
+    assert found[:, columns].all()
+    assert found[row].all()
+    assert found[:, columns[:-1] + 26].mean() < 0.1  # between two columns, but for the row
+
+
 def test_frames_of_a_folder_and_of_a_film_show_the_same_text(tmp_path):
     pictures = [with_text(p, k) for k, p in enumerate(cloth(30))]
     film = cv2.VideoWriter(str(tmp_path / "film.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (WIDTH, HEIGHT), False)
