@@ -19,16 +19,15 @@ by about 0.1 px, for `estimators.frame_solution.AprioriSd` to allow for.
 Assumed of the search from far: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this
 does not hold is refused, with the reason.
 
-Does a frame show the shell's edge twice, as two pictures that were mixed into one do?
+A frame that shows the edge twice is two pictures mixed into one (`fault_of_second_edge`). A second edge is the first
+one turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a deflection. Along a line across
+every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is taken for which most points have a
+step there. The limb of the Earth, torus and shadow are steps too, but follow no turned edge far: in 435 sound frames of
+28 films, with and without the Earth, 0.4 of the points agree at the most. A ring painted or sewn round the shell does;
+it is known by the points that agree with another radius.
 
-A second edge is the first one turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a
-deflection. Along a line across every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is
-taken for which most points have a step there. The limb of the Earth, torus and shadow are steps too, but follow no
-turned edge far: in 435 sound frames of 28 films, with and without the Earth, 0.4 of the points agree at the most. A
-ring painted or sewn round the shell does; it is known by the points that agree with another radius.
-
-Assumed: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter. Of frames mixed
-from two at random that were more than 4 sd wrong, half are noticed.
+Assumed there: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter. Of frames
+mixed from two at random that were more than 4 sd wrong, half are noticed.
 """
 
 from __future__ import annotations

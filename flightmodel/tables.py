@@ -8,15 +8,12 @@ Times are numbers in a unit, ISO 8601 in UTC, or IRIG day of year ``DDD:HH:MM:SS
 in the next one where that is nearer (a flight across New Year). Cells of the usual width are read many at a time;
 others, one by one, to the same number.
 
-Which quantity is a unit's, and how is it turned into SI?
-
 Units have short names in flight.toml and in the names of canonical columns (``_mps2``, ``_degc``); any other text is
 read by the library pint (``"slug/ft^3"``, ``"deg/hr"``, ``"inHg"``), as long as it is the unit of a quantity that a
 table may hold. One letter is never asked of the library: F is a farad there, and R the gas constant.
 
-Which rows of an oversampled track are used, by component and span?
-
-``every_s`` of a tracker in flight.toml is a number for all that it measures, a table by component, or a list of spans:
+Of an oversampled track some rows are used: ``every_s`` of a tracker in flight.toml is a number for all that it
+measures, a table by component, or a list of spans:
 
     every_s = 4.0
     every_s = { az = 4.0, el = 4.0 }

@@ -2,11 +2,9 @@
 
 Reading and writing of flight folders: `flightmodel.flightfolder`.
 
-When did the vehicle stand still on its pad, and what did its inertial sensors read there?
-
-Half-second blocks of samples are at rest where accelerometer and gyros scatter no more than in the first blocks, their
-means stay within that scatter, and the specific force has about the size of gravity: in free fall there is none, under
-a parachute it shakes. Only a rest with which the data begin is looked for.
+A rest on the pad with which the data begin (`find_rest`): half-second blocks of samples are at rest where accelerometer
+and gyros scatter no more than in the first blocks, their means stay within that scatter, and the specific force has
+about the size of gravity: in free fall there is none, under a parachute it shakes.
 """
 
 from __future__ import annotations

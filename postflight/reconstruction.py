@@ -5,19 +5,17 @@
 is an empty cell. A coefficient is ``C = m a / (q S)``, and its standard deviation carries those of the specific
 force, of dynamic pressure and of the mass. Columns, units and frames: docs/bet-product.md.
 
-What loads did the vehicle fly through, as the estimators of the deflection need them?
-
-Joins the siblings: corrected sensors at the c.g. and air data along the reconstructed trajectory (`recon`) become the
-`FlightLoads` of `estimators`, at the trajectory's even output rate and away from telemetry gaps. The sensors are
-averaged over a window short enough for the joint's own oscillation,
+The loads of the flight, as the estimators of the deflection need them (`loads_from_solution`): corrected sensors at the
+c.g. and air data along the reconstructed trajectory (`recon`) become the `FlightLoads` of `estimators`, at the
+trajectory's even output rate and away from telemetry gaps. The sensors are averaged over a window short enough for the
+joint's own oscillation,
 
     f_cg = mean(f) + w' x r + w x (w x r),     w' from the rates half a window apart.
 
-Does an attitude from magnetometer and Sun sensors alone agree with the trajectory's? A range's check, every run.
-
-The history of `recon.vector_attitude` minus the smoothed trajectory's attitude, about three body axes, against the sum
-of both covariances: NEES ``d^T (P_directions + P_trajectory)^-1 d`` and the share inside three standard deviations. It
-is independent where the trajectory neither used these sensors nor was started from them. See docs/attitude.md.
+An attitude from magnetometer and Sun sensors alone is compared with the trajectory's, as ranges do: the history of
+`recon.vector_attitude` minus the smoothed trajectory's attitude, about three body axes, against the sum of both
+covariances: NEES ``d^T (P_directions + P_trajectory)^-1 d`` and the share inside three standard deviations. It is
+independent where the trajectory neither used these sensors nor was started from them. See docs/attitude.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """What does ``postflight reconcile`` do? Fit the joint to a flight, write tables and figures, print the result.
 
-Can a fit be believed? Does it explain the measurements, with a vehicle and instruments that are as stated?
-
+A fit is checked (`credibility`): does it explain the measurements, with a vehicle and instruments as stated?
 Gauss-Newton steps also end where nothing flies as the flight did: in a false minimum, with a vehicle far from the
 stated one, or with a motion that does not join from span to span. Each check is a finding about data or model, as those
 of the reconstruction are (`recon.consistency`).

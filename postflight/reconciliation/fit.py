@@ -2,7 +2,7 @@
 
 ``max p(parameters | measurements)`` by Gauss-Newton (`gauss_newton`), first with all standard deviations many times
 wider, so that distant starts reach the minimum, at last with the estimated turbulence. The first stiffness is guessed
-on the loaded part of the flight (`start`). The covariance is that of the linear problem at the solution.
+on the loaded part of the flight (`stiffness_guess`). The covariance is that of the linear problem at the solution.
 
 Turbulence. A sounding's statistics extrapolated to a hundred metres are a guess, and a wrong guess biases the fit:
 turbulence assumed too strong leaves damping undetermined and low, too weak biases the offset. So the share of it is
@@ -24,11 +24,9 @@ Freeplay, creep and hardening are kept where the evidence favours them. Freeplay
 of the flight; where it is rejected the joint is fitted to the whole flight again. Creep is compared next, since a
 spring that hardens is a smaller part of what a shell does under load, then hardening.
 
-From which stiffness does the fit begin?
-
-A joint may be ten times softer or a thousand times stiffer than the vehicle file states, and Gauss-Newton steps from a
-joint that diverges under the flight's loads, or from one far too soft, end with another vehicle. So a few spans about
-the largest dynamic pressure are fitted from several stiffnesses, counted from the one at which the stated vehicle
+Start. A joint may be ten times softer or a thousand times stiffer than the vehicle file states, and Gauss-Newton steps
+from a joint that diverges under the flight's loads, or from one far too soft, end with another vehicle. So a few spans
+about the largest dynamic pressure are fitted from several stiffnesses, counted from the one at which the stated vehicle
 diverges, with wide standard deviations; the fit begins with the stiffness that explains them best.
 """
 
