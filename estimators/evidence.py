@@ -463,15 +463,18 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
     return replace(moved, time_s=time_s, by_input=linear | {one.time_bias: response})
 
 
-def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:
+def history_of_evidence(
+    evidence: Evidence, loads: FlightLoads, assumptions: str, seen: Evidence | None = None
+) -> DeflectionHistory:
     """History of a method by itself, sample by sample: NaN where it has no answer, or none with an uncertainty.
 
     The terms of the joint's oscillation are bounded by the rms of the readings' own derivatives over
-    `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives.
+    `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives. ``seen`` are readings of the same samples
+    that show the oscillation, for a method whose own do not.
     """
     rows, n = np.searchsorted(loads.time_s, evidence.time_s), len(loads.time_s)
     theta_yz, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-    swinging = _oscillation_var(evidence)[:, None, None] * np.eye(2)
+    swinging = _oscillation_var(evidence, seen or evidence)[:, None, None] * np.eye(2)
     theta_yz[rows] = np.where(np.isfinite(swinging[:, :1, 0]), evidence.mean_yz_rad, np.nan)
     cov[rows] = evidence.covariance + swinging
     quantiles = None
@@ -503,21 +506,28 @@ def _curved_quantiles(evidence: Evidence, swinging: FloatArray) -> FloatArray:
     return out
 
 
-def _oscillation_var(evidence: Evidence) -> FloatArray:
-    t, theta_yz = evidence.time_s, evidence.theta_yz_rad
+def _oscillation_var(evidence: Evidence, seen: Evidence) -> FloatArray:
+    """Mean square (n,), rad^2 an axis, of a method's terms of the oscillation that readings of the samples show."""
+    t, theta_yz = evidence.time_s, seen.theta_yz_rad
     if len(t) < 5:
         return np.zeros(len(t))
+    step = float(np.median(np.diff(t)))
     rate = np.gradient(theta_yz, t, axis=0)
     second = np.gradient(rate, t, axis=0)
-    window = max(1, round(_OSCILLATION_WINDOW_S / float(np.median(np.diff(t)))))
+    # the readings' own noise in differences of two and of three of them
+    noise = np.trace(seen.independent_cov, axis1=1, axis2=2)
+    window = max(1, round(_OSCILLATION_WINDOW_S / step))
     total = np.zeros(len(t))
-    for derivative, response in ((rate, evidence.by_rate_s), (second, evidence.by_acceleration_s2)):
-        square = np.sum(derivative**2, axis=1)
+    for derivative, response, noisy in (
+        (rate, evidence.by_rate_s, noise / (2.0 * step**2)),
+        (second, evidence.by_acceleration_s2, 6.0 * noise / (16.0 * step**4)),
+    ):
+        square = np.sum(derivative**2, axis=1) - noisy
         known = np.isfinite(square)
         share = uniform_filter1d(known.astype(float), window, mode="nearest")
         sums = uniform_filter1d(np.where(known, square, 0.0), window, mode="nearest")
         mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window)
-        total += 0.5 * mean_square * np.mean(np.sum(response**2, axis=2), axis=1)
+        total += 0.5 * np.maximum(mean_square, 0.0) * np.mean(np.sum(response**2, axis=2), axis=1)
     return total
 
 
