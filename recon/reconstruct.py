@@ -398,6 +398,8 @@ def reconstruct_once(
         checks += more
     series = _series(problem, sensors, reference, smoothed)
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
+    if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
+        findings += imu_screening.frozen_findings(telemetry.accelerometer)
     if sensors is not None:
         findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
     report(1.0, "done")
