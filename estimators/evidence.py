@@ -526,8 +526,8 @@ def _oscillation_var(evidence: Evidence, seen: Evidence) -> FloatArray:
         known = np.isfinite(square)
         share = uniform_filter1d(known.astype(float), window, mode="nearest")
         sums = uniform_filter1d(np.where(known, square, 0.0), window, mode="nearest")
-        mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window)
-        total += 0.5 * np.maximum(mean_square, 0.0) * np.mean(np.sum(response**2, axis=2), axis=1)
+        mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window).clip(0.0)
+        total += 0.5 * mean_square * np.mean(np.sum(response**2, axis=2), axis=1)
     return total
 
 
