@@ -22,9 +22,8 @@ angle ``alpha`` from the side of the unit vector ``e``, at the rate (that of the
 
 A body that cones by 25 deg goes on by 34 deg about the flow for every turn by its own gyro, and a steady wind looks to
 the latter as one that turns. The trajectory's is a Gauss-Markov process with the correlation time
-`TRAJECTORY_TIME_S`; the wind's is half constant bias, half Gauss-Markov with the correlation length `WIND_LENGTH_M` of
-altitude, as in the reconstruction of the atmosphere; so is the density's in the dynamic pressure, with
-`DENSITY_LENGTH_M`.
+`TRAJECTORY_TIME_S`; the wind's is half constant bias, half gravity waves along the altitude (`wind_error_root`); the
+density's in the dynamic pressure half constant, half Gauss-Markov with the correlation length `DENSITY_LENGTH_M`.
 
 Accelerometer and gyros have time biases of a millisecond or so: what oscillates is read late, and what the gyros carry
 from the accelerometer to the c.g. does not match the force. The camera's time bias is relative to both.
@@ -45,7 +44,7 @@ from scipy.ndimage import uniform_filter1d
 from estimators.balance import Swing
 from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel import rotations
-from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, sounding_correlation_root
+from flightmodel.atmosphere import DENSITY_LENGTH_M, sounding_correlation_root, wind_error_root
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import (
     QUANTILES,
@@ -62,9 +61,6 @@ CONSTANT_PART, TRAJECTORY_TIME_S = 0.5, 20.0  # assumed: half of the variance la
 # with three knots in this time, frames between two of them could err as a straight line only: the rest of the error
 # looked like the deflection's motion, and without spin like a c.g. station 4 sd off
 LIGHT_TIME_S, _LIGHT_KNOTS_A_TIME = 2.5, 10
-# a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
-# period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
-_WIND_KNOTS_A_LENGTH = 10
 ACCELEROMETER, ATTITUDE, WIND, PRESSURE = "accelerometer", "BET attitude", "wind", "dynamic pressure"
 CAMERA_TIME_BIAS = "camera time bias"
 ACCELEROMETER_TIME_BIAS, GYRO_TIME_BIAS = "accelerometer time bias", "gyro time bias"
@@ -161,7 +157,7 @@ def flow_inputs(loads: FlightLoads) -> dict[str, FloatArray]:
     c, s = np.cos(roll), np.sin(roll)
     # body components of vectors that do not roll
     body_from_fixed = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1)], axis=1)
-    gusts = sounding_correlation_root(loads.altitude_m, WIND_LENGTH_M, _WIND_KNOTS_A_LENGTH)
+    gusts = wind_error_root(loads.altitude_m)
     return {
         ACCELEROMETER: root,
         ATTITUDE: _rolled(body_from_fixed, trajectory[:, None] * correlation_root(loads.time_s, TRAJECTORY_TIME_S)),
@@ -467,15 +463,18 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
     return replace(moved, time_s=time_s, by_input=linear | {one.time_bias: response})
 
 
-def history_of_evidence(evidence: Evidence, loads: FlightLoads, assumptions: str) -> DeflectionHistory:
+def history_of_evidence(
+    evidence: Evidence, loads: FlightLoads, assumptions: str, seen: Evidence | None = None
+) -> DeflectionHistory:
     """History of a method by itself, sample by sample: NaN where it has no answer, or none with an uncertainty.
 
     The terms of the joint's oscillation are bounded by the rms of the readings' own derivatives over
-    `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives.
+    `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives. ``seen`` are readings of the same samples
+    that show the oscillation, for a method whose own do not.
     """
     rows, n = np.searchsorted(loads.time_s, evidence.time_s), len(loads.time_s)
     theta_yz, cov = np.full((n, 2), np.nan), np.full((n, 2, 2), np.nan)
-    swinging = _oscillation_var(evidence)[:, None, None] * np.eye(2)
+    swinging = _oscillation_var(evidence, seen or evidence)[:, None, None] * np.eye(2)
     theta_yz[rows] = np.where(np.isfinite(swinging[:, :1, 0]), evidence.mean_yz_rad, np.nan)
     cov[rows] = evidence.covariance + swinging
     quantiles = None
@@ -507,20 +506,27 @@ def _curved_quantiles(evidence: Evidence, swinging: FloatArray) -> FloatArray:
     return out
 
 
-def _oscillation_var(evidence: Evidence) -> FloatArray:
-    t, theta_yz = evidence.time_s, evidence.theta_yz_rad
+def _oscillation_var(evidence: Evidence, seen: Evidence) -> FloatArray:
+    """Mean square (n,), rad^2 an axis, of a method's terms of the oscillation that readings of the samples show."""
+    t, theta_yz = evidence.time_s, seen.theta_yz_rad
     if len(t) < 5:
         return np.zeros(len(t))
+    step = float(np.median(np.diff(t)))
     rate = np.gradient(theta_yz, t, axis=0)
     second = np.gradient(rate, t, axis=0)
-    window = max(1, round(_OSCILLATION_WINDOW_S / float(np.median(np.diff(t)))))
+    # the readings' own noise in differences of two and of three of them
+    noise = np.trace(seen.independent_cov, axis1=1, axis2=2)
+    window = max(1, round(_OSCILLATION_WINDOW_S / step))
     total = np.zeros(len(t))
-    for derivative, response in ((rate, evidence.by_rate_s), (second, evidence.by_acceleration_s2)):
-        square = np.sum(derivative**2, axis=1)
+    for derivative, response, noisy in (
+        (rate, evidence.by_rate_s, noise / (2.0 * step**2)),
+        (second, evidence.by_acceleration_s2, 6.0 * noise / (16.0 * step**4)),
+    ):
+        square = np.sum(derivative**2, axis=1) - noisy
         known = np.isfinite(square)
         share = uniform_filter1d(known.astype(float), window, mode="nearest")
         sums = uniform_filter1d(np.where(known, square, 0.0), window, mode="nearest")
-        mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window)
+        mean_square = np.divide(sums, share, out=np.full(len(t), np.nan), where=share > 0.5 / window).clip(0.0)
         total += 0.5 * mean_square * np.mean(np.sum(response**2, axis=2), axis=1)
     return total
 

@@ -45,6 +45,7 @@ from estimators.evidence import (
     moved_vehicle,
 )
 from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, lateral_and_size
+from estimators.misalignment import misalignment_evidence
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
@@ -176,11 +177,16 @@ def estimate_trim(loads: FlightLoads) -> DeflectionHistory:
     """Deflection and plane from the moment balance at every sample with enough deceleration; NaN elsewhere.
 
     The covariance propagates the BET's flow angle with the wind's, the initial offset, masses, c.g. stations, inertias,
-    C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's oscillation.
+    C_m, C_N and C_A, dynamic pressure and the angular acceleration, and bounds the joint's oscillation by what the
+    accelerometer shows of it: of a swing with ``A w^2`` near one the moment balance shows nothing.
     """
     rows = loads.rows(loads.informative)
     evidence = replace(trim_evidence(rows), half_curvature_rad=trim_curvature(rows))
-    return history_of_evidence(evidence, loads, _ASSUMPTIONS)
+    noise = loads.force_noise_sd_mps2 / rows.specific_force_body_mps2[:, 0]
+    seen = replace(
+        misalignment_evidence(rows, with_inputs=False), independent_cov=np.multiply.outer(noise**2, np.eye(2))
+    )
+    return history_of_evidence(evidence, loads, _ASSUMPTIONS, seen)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,10 @@ T. Shimanouchi, "Tables of molecular vibrational frequencies", NSRDS-NBS 39 (197
 A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars", Adv. Space Res. 2 (1982) 3.
 A. Seiff, D. Kirk, "Structure of the atmosphere of Mars in summer at mid-latitudes", J. Geophys. Res. 82 (1977) 4364.
 Emmert et al., "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022 (the table in ``data/atmosphere``).
+D. C. Fritts, T. E. VanZandt, "Spectral estimates of gravity wave energy and momentum fluxes, part I", J. Atmos. Sci. 50
+(1993) 3685: the waves' spectrum. D. C. Fritts, M. J. Alexander, "Gravity wave dynamics and effects in the middle
+atmosphere", Rev. Geophys. 41 (2003) 1003: their vertical wavelengths. R. J. Sica, A. T. Russell, "How many waves are in
+the gravity wave spectrum?", Geophys. Res. Lett. 26 (1999) 3617: a few carry most of it in the upper stratosphere.
 """
 
 from __future__ import annotations
@@ -37,7 +41,7 @@ import numpy as np
 from flightmodel.checks import ConfigError, FloatArray, GateError, check_finite, check_increasing
 from flightmodel.config import parse_utc
 from flightmodel.earth import MARS, STANDARD_GRAVITY_MPS2, WGS84, Planet
-from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_inverse, correlation_root
+from flightmodel.statistics import KNOTS_A_LENGTH, correlation, correlation_inverse, correlation_root, knots_root
 from flightmodel.telemetry import Sounding
 
 R_AIR_JPKGK = WGS84.gas_jpkgk
@@ -97,6 +101,12 @@ _ATOMS = np.array(
 # all altitudes (calibration, drag coefficient of the sphere); assumed, after falling spheres and datasondes
 DENSITY_LENGTH_M, WIND_LENGTH_M = 5000.0, 3000.0
 SOUNDING_CONSTANT_PART = 0.5
+# vertical wavelength of the gravity waves that a wind sounding misses or met at another phase: 2 to 5 km in the lower
+# stratosphere, 10 to 30 km at the mesopause; between them, where blunt vehicles have their pressure pulse
+_WAVE_LENGTH_M = 7000.0
+# a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
+# period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
+_WAVE_KNOT_M = 300.0
 TABLES = Path(__file__).parent / "data" / "atmosphere"
 TOP_M = 1.0e6
 BOTTOM_M, BOTTOM_MARS_M = -5000.0, -10000.0  # Hellas lies 8 km below Mars's ellipsoid
@@ -354,6 +364,37 @@ def sounding_correlation_root(
 ) -> FloatArray:
     """Root ``(n, k)`` of `sounding_correlation`: a sounding's error, over its sd, per unit normal."""
     return correlation_root(altitude_m, length_m, SOUNDING_CONSTANT_PART, knots_a_length)
+
+
+@cache
+def _wave_table() -> tuple[FloatArray, FloatArray]:
+    """Distances, in wavelengths over 2 pi, and the waves' correlation over them, by the spectrum's transform."""
+    step, count = 0.005, 2**15  # to 160 times the characteristic wavenumber: it leaves 2e-5 of the variance out
+    x = step * np.arange(count + 1)
+    even = np.fft.irfft(x / (1.0 + x**4))[:count]
+    return np.asarray(np.pi / (step * count) * np.arange(count)), np.asarray(even / even[0])
+
+
+def wave_correlation(apart_m: FloatArray) -> FloatArray:
+    """Correlation of the wind of gravity waves between altitudes so far apart, m.
+
+    Their spectrum over vertical wavenumber is ``x / (1 + x^4)`` with ``x`` the wavenumber over the characteristic one:
+    saturated waves fall as ``x^-3``. Half a wavelength away the wind is more likely the opposite one.
+    """
+    return np.interp(2.0 * np.pi / _WAVE_LENGTH_M * np.abs(apart_m), *_wave_table())
+
+
+def wind_error_root(altitude_m: FloatArray) -> FloatArray:
+    """Error ``(n, k)`` of a sounded wind component at altitudes (n,), over its sd, per unit normal.
+
+    Half of the variance is one constant, half are gravity waves (`wave_correlation`), with straight lines between knots
+    that resolve gusts into which a vehicle turns. A Gauss-Markov history over `WIND_LENGTH_M` has a third of the waves'
+    power at their own wavelength: a wave of the stated size then looks like methods that disagree.
+    """
+    constant = np.full((len(altitude_m), 1), np.sqrt(SOUNDING_CONSTANT_PART))
+    waves = knots_root(altitude_m, _WAVE_KNOT_M, lambda knots: wave_correlation(knots[:, None] - knots))
+    size = np.sqrt(np.sum(waves**2, axis=1, keepdims=True))  # straight lines between knots are a little too small
+    return np.column_stack([constant, np.sqrt(1.0 - SOUNDING_CONSTANT_PART) / size * waves])
 
 
 def unresolved_variance(spacing_m: FloatArray | float, length_m: float) -> FloatArray:

@@ -14,6 +14,8 @@ A. Gelb (ed.), Applied Optimal Estimation, MIT Press, 1974, section 3.8 (exponen
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.special import gammaincinv
 
@@ -118,17 +120,37 @@ def correlation_root_and_rest(
 
 
 def _gauss_markov_root(at: FloatArray, length: float, knots_a_length: int) -> FloatArray:
+    return knots_root(at, length / knots_a_length, lambda knots: correlation(knots, length))
+
+
+def knots_root(at: FloatArray, spacing: float, correlation_of: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Errors ``(n, k)`` at places ``(n,)`` per unit normal, drawn at knots with straight lines between.
+
+    Parameters
+    ----------
+    at : (n,) float
+        In any order.
+    spacing : float
+        Of the knots, at most; in the unit of ``at``.
+    correlation_of : callable
+        From the knots (k,) to the correlation (k, k) of the error at them.
+    """
     if len(at) == 0 or np.ptp(at) == 0.0:
         return np.ones((len(at), 1))
     low, high = float(at.min()), float(at.max())
-    knots = np.linspace(low, high, max(2, int(np.ceil(knots_a_length * (high - low) / length)) + 1))
+    knots = np.linspace(low, high, max(2, int(np.ceil((high - low) / spacing)) + 1))
     position = np.clip((at - low) / max(knots[1] - knots[0], 1e-12), 0.0, len(knots) - 1.0)
     k = np.minimum(position.astype(int), len(knots) - 2)
     fraction = position - k
     between = np.zeros((len(at), len(knots)))
     row = np.arange(len(at))
     between[row, k], between[row, k + 1] = 1.0 - fraction, fraction
-    return np.asarray(between @ np.linalg.cholesky(correlation(knots, length)))
+    together = correlation_of(knots)
+    try:
+        root = np.linalg.cholesky(together)
+    except np.linalg.LinAlgError:  # knots so close together that they are one
+        root = symmetric_root(together)
+    return np.asarray(between @ root)
 
 
 def jackknife_variance(without: FloatArray) -> FloatArray:

@@ -515,6 +515,25 @@ def frozen_samples(column: FloatArray, noise_sd: float) -> BoolArray:
     return out
 
 
+def frozen_rows(record: TriadRecord) -> BoolArray:
+    """Samples (n,) of which an axis along body x is frozen, as at the end of its range: they do not show the drag."""
+    out: BoolArray = np.zeros(len(record.time_s), dtype=bool)
+    for column in record.measured_sensor.T[np.abs(record.spec.dcm_body_sensor[0]) > 1e-9]:
+        there = np.flatnonzero(np.isfinite(column))
+        out[there] |= frozen_samples(column[there], record.spec.noise_sd)
+    return out
+
+
+def frozen_findings(record: TriadRecord) -> list[Finding]:
+    """Spans of `frozen_rows`, which are left out."""
+    first, last = runs(frozen_rows(record))
+    t, remark = record.time_s, "frozen at one value (the end of its range, or no new data): left out"
+    return [
+        Finding(record.spec.name, remark, float(t[a]), float(t[b]), "frozen-data")
+        for a, b in zip(first, last, strict=True)
+    ]
+
+
 def repeat_by_noise(column: FloatArray, noise_sd: float) -> float:
     """Largest probability that noise leaves a reading where it is."""
     if noise_sd <= 0.0:

@@ -68,6 +68,7 @@ from recon._measurement_kernels import (
     SUN,
     VELOCITY,
 )
+from recon.imu_screening import frozen_rows
 from recon.propagation import Motion
 from recon.state import DRIVERS, ErrorModel, States, right_jacobian
 
@@ -326,11 +327,14 @@ def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: Fl
 
 
 def deceleration_instrument(record: TriadRecord) -> Instrument:
-    """Deceleration by an accelerometer whose body x axis is taken to lie along the velocity against the air."""
+    """Deceleration by an accelerometer whose body x axis is taken to lie along the velocity against the air.
+
+    Frozen samples are left out: of a sensor at the end of its range the density came out 39 sd low, all checks green.
+    """
     spec, axial = record.spec, record.spec.dcm_body_sensor[0]
     used = np.abs(axial) > 1e-9
     reading = -record.measured_sensor[:, used] @ axial[used]
-    there = np.isfinite(reading)
+    there = np.isfinite(reading) & ~frozen_rows(record)
     t, reading = record.time_s[there], reading[there]
     block = np.floor(t * DECELERATION_RATE_HZ).astype(np.int64)
     first = np.flatnonzero(np.diff(block, prepend=-(2**62)))

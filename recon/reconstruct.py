@@ -397,9 +397,7 @@ def reconstruct_once(
         more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
         checks += more
     series = _series(problem, sensors, reference, smoothed)
-    findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
-    if sensors is not None:
-        findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
+    findings = _sensor_findings(telemetry, sensors, adaptation)
     report(1.0, "done")
     path = datum_trajectory(problem, mount, reference, smoothed.triangles)
     return TrajectorySolution(
@@ -557,6 +555,16 @@ def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting
         return Mounting(telemetry.t0_utc, np.zeros(3), None)
     arm = sensors.force.spec.position_from_datum_body_m
     return Mounting(telemetry.t0_utc, arm, sensors.rate)
+
+
+def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Finding]:
+    """What the inertial sensors' samples show by themselves."""
+    findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
+    if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
+        findings += imu_screening.frozen_findings(telemetry.accelerometer)
+    if sensors is not None:
+        findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
+    return findings
 
 
 def _series(

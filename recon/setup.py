@@ -61,6 +61,7 @@ _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
 _ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 _NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
+_MOST_NODES = 2_000_000  # 28 h of a deceleration at 20 Hz, some 4 GB: an entry takes minutes
 _BALLISTIC_STEP_S = 0.5  # drivers are constant within a step, and decorrelate in seconds and kilometres
 _DIFFUSE_POSITION_M = 1000.0  # no information beside one point of any tracker
 _DIFFUSE_VELOCITY_MPS = 100.0  # the same, beside the line that is fitted
@@ -112,6 +113,12 @@ def build_problem(
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
     between = np.arange(start_s, end_s, _BALLISTIC_STEP_S) if sensors is None else np.empty(0)
     time_s = _union([output_s, between, *inside])
+    if sensors is None and len(time_s) > _MOST_NODES:
+        raise GateError(
+            f"reconstruction: {end_s - start_s:.6g} s of ballistic flight in {len(time_s)} steps, where {_MOST_NODES} "
+            "are the most. Check the unit of the times, or limit them by use_s",
+            code="flight-too-long",
+        )
     observed, row = observe(time_s, instruments)
     if sensors is None:
         across = _cross_path_direction(track[1]) if stated is None else _normal_of_path(stated)

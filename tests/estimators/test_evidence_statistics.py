@@ -84,3 +84,17 @@ def test_readings_beside_holes_keep_their_uncertainty():
     added = np.trace(history.lateral_cov, axis1=1, axis2=2)
     inside = clear & ~gone & (np.arange(len(gone)) > 500)
     assert np.mean(added[inside]) == pytest.approx(want, rel=0.05)
+
+
+def test_a_swing_that_a_method_does_not_show_is_bounded_by_one_that_does():
+    # the moment balance reads theta + A theta'': of a swing with A w^2 = 1 nothing, and is wrong by all of it
+    one, loads, want, clear = sine_left_out([0.6, 0.8])
+    blind = replace(one, theta_yz_rad=np.full_like(one.theta_yz_rad, 0.02))
+    alone = np.trace(history_of_evidence(blind, loads, "").lateral_cov, axis1=1, axis2=2)
+    assert np.mean(alone[clear]) < 0.01 * want
+    noise = 1e-4 * np.random.default_rng(8).standard_normal(one.theta_yz_rad.shape)
+    seen = replace(
+        one, theta_yz_rad=one.theta_yz_rad + noise, independent_cov=np.tile(1e-8 * np.eye(2), (len(noise), 1, 1))
+    )
+    added = np.trace(history_of_evidence(blind, loads, "", seen).lateral_cov, axis1=1, axis2=2)
+    assert np.mean(added[clear]) == pytest.approx(want, rel=0.05)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import chi2
 
 from flightmodel.atmosphere import (
@@ -10,6 +11,8 @@ from flightmodel.atmosphere import (
     sounding_correlation,
     sounding_correlation_root,
     unresolved_variance,
+    wave_correlation,
+    wind_error_root,
 )
 from flightmodel.statistics import (
     chi_square_quantile,
@@ -83,3 +86,34 @@ def test_a_mean_s_jackknife_is_its_standard_error():
     x = np.random.default_rng(5).standard_normal((9, 2))
     without = np.array([np.delete(x, k, axis=0).mean(axis=0) for k in range(9)])
     np.testing.assert_allclose(jackknife_variance(without), x.var(axis=0, ddof=1) / 9.0, rtol=1e-12)
+
+
+def test_waves_have_the_spectrum_of_saturated_ones():
+    for apart_m in (0.0, 400.0, 2000.0, 3500.0, 9000.0):
+        a = 2.0 * np.pi * apart_m / 7000.0
+        want = 4.0 / np.pi * quad(lambda x, a=a: x / (1.0 + x**4) * np.cos(a * x), 0.0, 300.0, limit=2000)[0]
+        assert wave_correlation(np.array([apart_m]))[0] == pytest.approx(want, abs=1e-3)
+
+
+def test_the_wind_s_error_is_a_constant_and_waves():
+    at = 30e3 + 300.0 * np.array([4.0, 0.0, 2.0, 6.0, 1.0, 3.0, 5.0])  # on the knots, shuffled
+    root = wind_error_root(at)
+    want = SOUNDING_CONSTANT_PART + (1.0 - SOUNDING_CONSTANT_PART) * wave_correlation(at[:, None] - at)
+    assert np.allclose(root @ root.T, want, atol=1e-12)
+    assert np.allclose((wind_error_root(np.linspace(20e3, 60e3, 999)) ** 2).sum(axis=1), 1.0)
+    # a metre of altitude, one altitude, none: still one constant and what can change
+    assert wind_error_root(np.full(3, 4e4)).shape == (3, 2)
+    assert np.isfinite(wind_error_root(np.linspace(4e4, 4e4 + 1e-6, 5))).all()
+    assert wind_error_root(np.empty(0)).shape == (0, 2)
+
+
+@pytest.mark.parametrize("length_m", [5000.0, 7000.0, 10000.0])
+def test_a_wave_of_the_stated_size_is_no_contradiction(length_m):
+    # half of the variance in one wave: its chi-square is no more than the readings' number
+    at = np.arange(30e3, 60e3, 1000.0)
+    root = wind_error_root(at)
+    cov = root @ root.T + 0.2**2 * np.eye(len(at))
+    wave = np.sin(2.0 * np.pi * at / length_m)
+    assert wave @ np.linalg.solve(cov, wave) < len(at)
+    markov = sounding_correlation(at, WIND_LENGTH_M) + 0.2**2 * np.eye(len(at))
+    assert wave @ np.linalg.solve(markov, wave) > 1.5 * wave @ np.linalg.solve(cov, wave)

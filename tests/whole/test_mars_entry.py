@@ -5,6 +5,7 @@ import pytest
 
 import postflight as pf
 from flightmodel import earth
+from flightmodel.checks import GateError
 from flightmodel.statistics import chi_square_quantile
 from postflight.run_folder import peak_table
 from tests.oracles import mars_entry
@@ -206,6 +207,35 @@ def test_a_density_that_the_atmosphere_does_not_allow_is_red(tmp_path):
         assert sound.count(old) == 1
         (tmp_path / "flight.toml").write_text(sound.replace(old, new))
         assert not check().passed, new
+
+
+def spoilt(truth, folder, rows):
+    """Folder of an entry whose accelerometer's table (n, 2) is changed."""
+    mars_entry.write(truth, folder)
+    table = np.loadtxt(folder / "accelerometer.csv", delimiter=",", skiprows=1)
+    np.savetxt(folder / "accelerometer.csv", rows(table), "%.6f", ",", header="t_s,ax_mps2", comments="")
+    return pf.read_flight(folder)
+
+
+def test_an_accelerometer_at_the_end_of_its_range_shows_no_drag(tmp_path):
+    """The readings that stay at the end of the range were taken for the drag: density 39 sd low, all green."""
+    truth = mars_entry.fly(906, to_s=120.0)
+    limit = 0.6 * truth.axial_mps2.max()
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: np.maximum(rows, [-np.inf, -limit])))
+    found = bet.density
+    true = np.exp(np.interp(found.time_s, truth.time_s, np.log(truth.density_kgpm3)))
+    assert np.abs((found.density_kgpm3 - true) / found.density_sd_kgpm3).max() < 4.0
+    (span,) = (one for one in bet.solution.findings if one.code == "frozen-data")
+    beyond = truth.time_s[truth.axial_mps2 > limit]
+    assert (span.start_s, span.end_s) == pytest.approx((beyond[0], beyond[-1]), abs=1.0)
+
+
+def test_milliseconds_as_seconds_are_refused(tmp_path):
+    """Memory ran out: a row every millisecond of what was stated for seconds."""
+    truth = mars_entry.fly(907, to_s=120.0)
+    with pytest.raises(GateError) as refusal:
+        pf.reconstruct(spoilt(truth, tmp_path, lambda rows: rows * [1000.0, 1.0]))
+    assert refusal.value.codes == ("flight-too-long",)
 
 
 def test_both_engines_agree(tmp_path):
