@@ -49,7 +49,7 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
-from recon.entry_density import density_by_drag, density_check, profile_as_flown
+from recon.entry_density import density_by_drag, density_check, drag_jump_check, profile_as_flown
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
@@ -140,7 +140,7 @@ class Reconstruction(Tabular):
         Comparison with an attitude from magnetometer and Sun sensors alone.
     density : DataFrame or None
         Air by the deceleration with the drag of [drag], `recon.entry_density`.
-    density_check : ConsistencyCheck or None
+    density_checks : tuple of ConsistencyCheck
         Of that density against the stated atmosphere's.
     """
 
@@ -153,7 +153,7 @@ class Reconstruction(Tabular):
     missing: tuple[Fault, ...] = ()
     attitude: AttitudeCheck | None = None
     density: pd.DataFrame | None = None
-    density_check: ConsistencyCheck | None = None
+    density_checks: tuple[ConsistencyCheck, ...] = ()
 
     @property
     def telemetry(self) -> Telemetry:
@@ -169,8 +169,7 @@ class Reconstruction(Tabular):
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
         """Checks of the trajectory, then of its attitude, then of the atmosphere."""
         attitude, air = (part.consistency_checks if part is not None else () for part in (self.attitude, self.as_flown))
-        by_drag = () if self.density_check is None else (self.density_check,)
-        return self.solution.consistency_checks + attitude + air + by_drag
+        return self.solution.consistency_checks + attitude + air + self.density_checks
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -284,10 +283,11 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
     stated = profile = profile_from_sounding(telemetry.sounding)
-    density = check = None
+    density, checks = None, tuple[ConsistencyCheck, ...]()
     if telemetry.drag is not None:
         density = density_by_drag(telemetry, solution.smoothed, solution.drag)
-        check = density_check(density, stated, solution.settings.check_confidence)
+        found = (each(density, stated, solution.settings.check_confidence) for each in (density_check, drag_jump_check))
+        checks = tuple(each for each in found if each is not None)
         profile = profile_as_flown(stated, density)
     air = airdata.air_data(solution.smoothed, profile, _arm(flight.vehicle))
     loads, as_flown = None, None
@@ -301,7 +301,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     except GateError as fault:
         missing += fault.faults
     return Reconstruction(
-        flight, solution, air, profile, loads, as_flown, tuple(missing), density=density, density_check=check
+        flight, solution, air, profile, loads, as_flown, tuple(missing), density=density, density_checks=checks
     )
 
 

@@ -37,6 +37,7 @@ from flightmodel import earth
 from flightmodel.airdata import AirData, air_data
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
+    SOUNDING_CONSTANT_PART,
     AtmosphereProfile,
     gas_constant,
     profile_from_sounding,
@@ -56,6 +57,7 @@ LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is gi
 _LEAST_FELT = 0.2
 _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
+_APART_S, _NOISE_SPAN_S = 2, 11  # a parachute inflates within a second or two; over a few seconds noise is the same
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
 
 
@@ -281,6 +283,57 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
         float(-ndtri(0.5 * (1.0 - confidence) / len(layers))), f"{found}, within what both may err", found,
         advice="the air differed, or mass, area or C_A of [drag], height or speed of the stated state, or the "
         "accelerometer's unit is wrong", component=name,
+    )  # fmt: skip
+
+
+def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+    """Check that the density by the drag does not jump, as where a parachute opens or a part separates.
+
+    Means over a second are compared with those two seconds before, or before a gap, since the filter rejects the first
+    readings of another drag. What the air may change between the two heights beside the stated density follows from its
+    uncertainty, of which the constant part has no share; what the readings scatter, from differences of neighbours.
+    Errors of speed and height are the same at both times.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of `density_by_drag`.
+    stated : AtmosphereProfile
+    confidence : float
+        Two-sided, of the check.
+
+    Returns
+    -------
+    ConsistencyCheck or None
+        None where no two means are two seconds apart or more.
+    """
+    log_ratio = np.log(table["density_ratio"])
+    beside = table["time_s"].diff() < 1.0  # not across a gap
+    noise = 0.5 * log_ratio.diff().where(beside) ** 2
+    rows = pd.DataFrame({"log_ratio": log_ratio, "height": table["altitude_m"], "noise": noise, "count": 1.0})
+    whole = rows.groupby(np.floor(table["time_s"]).astype(int)).agg(
+        {"log_ratio": "mean", "height": "mean", "noise": "mean", "count": "sum"}
+    )
+    noise = whole["noise"].rolling(_NOISE_SPAN_S, center=True, min_periods=1).mean() / whole["count"]
+    second = whole.index.to_numpy()
+    at = np.searchsorted(second, second - _APART_S, side="right") - 1
+    last = np.flatnonzero(at >= 0)
+    if not len(last):
+        return None
+    before, after = whole.iloc[at[last]], whole.iloc[last]
+    heights = before["height"].to_numpy(), after["height"].to_numpy()
+    forgotten = 1.0 - np.exp(-np.abs(heights[1] - heights[0]) / DENSITY_LENGTH_M)
+    weather = 2.0 * (1.0 - SOUNDING_CONSTANT_PART) * forgotten * stated.at(heights[1]).density_sd ** 2
+    change = after["log_ratio"].to_numpy() - before["log_ratio"].to_numpy()
+    jump = change / np.sqrt(weather + noise.to_numpy()[last] + noise.to_numpy()[at[last]])
+    worst = int(np.argmax(np.abs(jump)))
+    when = f"from {before.index[worst]} to {after.index[worst]} s"
+    found = f"{np.exp(change[worst]):.2g} times the stated atmosphere's change {when}"
+    return consistency_check(
+        "drag-jump", "density by the drag does not jump", float(np.abs(jump[worst])), 0.0,
+        float(-ndtri(0.5 * (1.0 - confidence) / len(last))), f"{found}, as air may", found,
+        advice="a parachute opened, a part separated or the reading jumped: leave out what follows by use_s, or state "
+        "the drag of each part of the flight by itself", component=when,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import norm
 
@@ -13,7 +14,7 @@ from flightmodel.trajectory import Trajectory, difference
 from recon import reconstruct
 from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
-from recon.entry_density import _spread
+from recon.entry_density import _spread, drag_jump_check
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -328,3 +329,30 @@ def test_readings_corrected_in_blocks_are_those_corrected_at_once(monkeypatch):
     monkeypatch.setattr(reconstruct, "_BLOCK", 7)
     for whole, parts in zip(at_once, corrected_series(problem, force, rate, states), strict=True):
         np.testing.assert_array_equal(parts, whole)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.5, 1.0 / 1.5])
+def test_a_jump_of_the_density_by_drag_is_counted_in_what_the_air_may_change(factor):
+    """Vertical speed 300 m/s: the half of a variance of 20 % that is forgotten over 5 km has 2 (1 - e^-0.12) of it."""
+    rng, noise, per_s, stated_sd = np.random.default_rng(5), 0.004, 20, 0.2
+    time_s = 50.0 + np.arange(60 * per_s) / per_s
+    log_ratio = 0.3 + noise * rng.standard_normal(len(time_s)) + np.log(factor) * (time_s >= 80.0)
+    table = pd.DataFrame(
+        {"time_s": time_s, "altitude_m": 40e3 - 300.0 * (time_s - 50.0), "density_ratio": np.exp(log_ratio)}
+    )
+    stated = SimpleNamespace(at=lambda height_m: SimpleNamespace(density_sd=np.full(len(height_m), stated_sd)))
+    check = drag_jump_check(table, stated, 0.999)
+    assert check.passed == (factor == 1.0)
+    if factor == 1.0:
+        assert check.value < 0.2  # the air's part is many times the scatter
+    else:
+        weather = stated_sd**2 * (1.0 - np.exp(-600.0 / 5000.0))
+        expected = abs(np.log(factor)) / np.sqrt(weather + 2.0 * noise**2 / per_s)
+        assert check.value == pytest.approx(expected, rel=0.02)
+        assert check.component in ("from 78 to 80 s", "from 79 to 81 s")
+        # across a gap, in which the air may change more
+        weather = stated_sd**2 * (1.0 - np.exp(-300.0 * 7.0 / 5000.0))
+        gap = drag_jump_check(table[(time_s < 77.0) | (time_s > 83.0)], stated, 0.999)
+        assert gap.value == pytest.approx(abs(np.log(factor)) / np.sqrt(weather + 2.0 * noise**2 / per_s), rel=0.03)
+    # nothing to compare in a second's rows
+    assert drag_jump_check(table[:per_s], stated, 0.999) is None

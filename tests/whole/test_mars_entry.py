@@ -9,6 +9,7 @@ from flightmodel.checks import GateError
 from flightmodel.statistics import chi_square_quantile
 from postflight.run_folder import peak_table
 from tests.oracles import mars_entry
+from tests.refusing import numbers_in
 
 AT_S = np.array([0.0, 40.0, 60.0, 80.0, 110.0, 160.0])
 
@@ -228,6 +229,18 @@ def test_an_accelerometer_at_the_end_of_its_range_shows_no_drag(tmp_path):
     (span,) = (one for one in bet.solution.findings if one.code == "frozen-data")
     beyond = truth.time_s[truth.axial_mps2 > limit]
     assert (span.start_s, span.end_s) == pytest.approx((beyond[0], beyond[-1]), abs=1.0)
+
+
+@pytest.mark.parametrize(("times", "passed"), [(1.0, True), (1.8, False)])
+def test_a_drag_that_jumps_is_red(tmp_path, times, passed):
+    """As where a parachute opens, after which the density was several times too large and every check green."""
+    truth = mars_entry.fly(908, to_s=125.0)
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: np.where(rows[:, :1] > 115.0, rows * [1.0, times], rows)))
+    (check,) = (one for one in bet.consistency_checks if one.code == "drag-jump")
+    assert check.passed == passed
+    if not passed:
+        before, after = numbers_in(check.component)
+        assert before <= 115.0 < after < 122.0
 
 
 def test_milliseconds_as_seconds_are_refused(tmp_path):
