@@ -219,6 +219,7 @@ class OrientedCamera(FrameModel):
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
         """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""
         steepness = steepness_of(frame.image, horizon)
+        # no comparison with NaN is true: of too few points nothing is said
         if min(steepness, self.steepness) < _AS_SHARP * max(steepness, self.steepness):
             raise NoFitError(
                 f"the edge rises over its middle pixel by {100.0 * steepness:.0f} % of its step, the benchmark frame's "

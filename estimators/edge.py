@@ -373,9 +373,9 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
     image : (h, w) uint8
     horizon : HorizonLine
     """
-    lines = ScanLines(horizon.points_px, horizon.inward_px, _ACROSS_PX, _ACROSS_PX, horizon.line)
     if len(horizon.points_px) < _LEAST_POINTS:
         return float("nan")
+    lines = ScanLines(horizon.points_px, horizon.inward_px, _ACROSS_PX, _ACROSS_PX, horizon.line)
     grey, inside = sampled(image, lines, round(2.0 * _ACROSS_PX / STEP_PX) + 1)
     levels = grey[inside.all(axis=1)]
     if len(levels) < _LEAST_POINTS:

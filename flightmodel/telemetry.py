@@ -441,6 +441,11 @@ class Telemetry:
         moves = self.motion.model == "ballistic" or (self.accelerometer is not None and self.rates is not None)
         return self.vehicle is not None and moves and bool(self.radars or self.gnss)
 
+    @property
+    def drag_accelerometer(self) -> TriadRecord | None:
+        """The accelerometer whose deceleration the drag of ballistic flight follows; None where none does."""
+        return self.accelerometer if self.motion.trim_sd_rad > 0.0 else None
+
     def required_triads(self) -> tuple[TriadRecord, TriadRecord]:
         """Return accelerometer and rates, or raise `GateError` where flight.toml names none."""
         if self.accelerometer is None or self.rates is None:

@@ -560,8 +560,8 @@ def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting
 def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Finding]:
     """What the inertial sensors' samples show by themselves."""
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
-    if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
-        findings += imu_screening.frozen_findings(telemetry.accelerometer)
+    if telemetry.drag_accelerometer is not None:
+        findings += imu_screening.frozen_findings(telemetry.drag_accelerometer)
     if sensors is not None:
         findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
     return findings

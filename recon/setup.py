@@ -259,8 +259,8 @@ def _accelerometer_arm(sensors: InertialSensors | None) -> FloatArray:
 def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: FloatArray) -> tuple[Instrument, ...]:
     """Radars, receivers and barometers, and an accelerometer that measures ballistic flight's deceleration."""
     traverse = settings.angle_noise == "traverse"
-    planet, trim_rad = telemetry.planet, telemetry.motion.trim_sd_rad
-    ballistic = telemetry.accelerometer is None or telemetry.rates is None or trim_rad > 0.0
+    planet, drag = telemetry.planet, telemetry.drag_accelerometer
+    ballistic = telemetry.accelerometer is None or telemetry.rates is None or drag is not None
     out: list[Instrument] = []
     for name, record in telemetry.radars.items():
         cg = telemetry.vehicle.cg_m if telemetry.vehicle is not None and record.point == "cg" else np.zeros(3)
@@ -275,8 +275,8 @@ def tracking_instruments(telemetry: Telemetry, settings: Settings, arm_body_m: F
         out += measurements.gnss_instruments(name, fixes, antenna if ballistic else arm_body_m, planet, near)
     for name, heights in telemetry.barometers.items():
         out.append(measurements.barometer_instrument(name, heights, arm_body_m))
-    if telemetry.accelerometer is not None and trim_rad > 0.0:
-        out.append(measurements.deceleration_instrument(telemetry.accelerometer))
+    if drag is not None:
+        out.append(measurements.deceleration_instrument(drag))
     return tuple(out)
 
 
@@ -321,9 +321,9 @@ def _build_error_model(telemetry: Telemetry, sensors: InertialSensors | None, at
     """All errors that the flight file states, drivers of the motion first."""
     if sensors is None:
         blocks = ballistic_blocks(telemetry.motion)
-        if telemetry.accelerometer is not None and telemetry.motion.trim_sd_rad > 0.0:
+        if telemetry.drag_accelerometer is not None:
             tracked = bool(telemetry.radars or telemetry.gnss or telemetry.barometers)
-            blocks += deceleration_blocks(telemetry.accelerometer.spec, telemetry.motion.trim_sd_rad, tracked)
+            blocks += deceleration_blocks(telemetry.drag_accelerometer.spec, telemetry.motion.trim_sd_rad, tracked)
     else:
         blocks = imu_blocks(sensors.force.spec, sensors.rate.spec)
     for radar in telemetry.radars.values():

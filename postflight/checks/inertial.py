@@ -13,7 +13,7 @@ detected: a body that hardly rotates is no contradiction where the force hardly 
 carried force has a direction of its own; the prior is suspicious beyond four standard deviations of itself and of the
 gyros' drift since.
 
-Do accelerometer and gyros sense one oscillation, at one time and in one set of axes? (`recon.oscillation`).
+Accelerometer and gyros sense one oscillation, at one time and in one set of axes: `recon.oscillation`.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, TriadSpec, sun_angles_from_direction
-from flightmodel.telemetry import BarometerRecord, GnssRecord, Motion, RadarRecord, TriadRecord
+from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, TriadRecord
 from recon import _measurement_kernels
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
 from recon.measurements import (
@@ -410,7 +410,7 @@ def test_datum_and_cg_tracks_differ_by_the_arm():
         accelerometer=True,
         rates=True,
         planet=earth.WGS84,
-        motion=Motion(),
+        drag_accelerometer=None,
         vehicle=SimpleNamespace(cg_m=cg),
     )
     arms = {i.name: i.arm_body_m for i in tracking_instruments(telemetry, Settings(), imu)}

@@ -151,8 +151,8 @@ class TestPrometheus:
         r = fly("rocketpy_prometheus", without=("baro",))
         assert 0.2 < foretold(r, "baro")["baro height"] < 2.2
 
-    def test_nothing_told_of_thrust_drogue_and_landing(self, fly):
-        """What powered_s and use_s told is found from the track, and the flight between comes out the same."""
+    def test_thrust_drogue_and_landing_are_found_unstated(self, fly):
+        """What powered_s and use_s state is found from the track, and the flight between comes out the same."""
         raw = fly("rocketpy_prometheus", ALL_TIMES, THRUST_UNSTATED)
         found = disturbances(raw)
         assert some_overlap(found, 0.0, 6.0)
@@ -199,13 +199,13 @@ class TestBlackBrant:
     def test_no_acceleration_is_left_over(self, fly):
         assert not disturbances(fly("radar_36353"))
 
-    def test_nothing_told_of_echoes_gaps_and_loss(self, fly):
+    def test_echoes_gaps_and_loss_are_found_unstated(self, fly):
         """Thrust behind a minute's gap, points that settle, echoes before landing, loss: found, the coast unharmed."""
-        told, raw = fly("radar_36353"), fly("radar_36353", ALL_TIMES, DISTURBED_UNSTATED)
+        stated, raw = fly("radar_36353"), fly("radar_36353", ALL_TIMES, DISTURBED_UNSTATED)
         found = disturbances(raw)
         assert some_overlap(found, 1.65, 60.7)
         assert not some_overlap(found, 100.0, 650.0)
-        assert largest_difference(told, raw) < 3.0
+        assert largest_difference(stated, raw) < 3.0
         assert sd_at(raw, 30.0, POSITION) > 5e3
 
     def test_drag_has_the_history_of_a_body_that_enters_and_opens_a_parachute(self, fly):
