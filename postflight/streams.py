@@ -14,7 +14,9 @@ import unicodedata
 from typing import Any, TextIO
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidi, zero width), half a character, line ends
-_M_MMAP_THRESHOLD, _LARGE_BYTES = -3, 1 << 20  # of malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+# a map of its own is cleared page by page whenever it is made: smaller arrays come and go all the time
+_LARGE_BYTES, _HELD_BYTES = 4 << 20, 64 << 20
 _KEPT = {"\n", "\t"}
 
 
@@ -92,13 +94,15 @@ def leave_arrow_out() -> None:
 
 
 def return_large_arrays() -> None:
-    """Let each array of a megabyte or more be a map of its own, which the system has back as soon as it is freed.
+    """Let each array of `_LARGE_BYTES` or more be a map of its own, which the system has back as soon as it is freed.
 
     The GNU C library by itself raises that size to the largest array that was freed so far (32 MB at most): those of a
-    filter pass then lie on the heap, where what is left between them keeps 150 MB of a run. Of another C library
-    nothing is asked.
+    filter pass then lie on the heap, where what is left between them keeps 40 MB of a run. Of what is free at the end
+    of the heap it may hold `_HELD_BYTES`. Of another C library nothing is asked.
     """
     from ctypes import CDLL
 
     with contextlib.suppress(AttributeError, OSError, TypeError):
-        CDLL(None).mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+        library = CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+        library.mallopt(_M_TRIM_THRESHOLD, _HELD_BYTES)

@@ -66,7 +66,7 @@ large = np.ones(3_000_000)  # 24 MB: freed, it raises the size from which the C 
 del large
 arrays, small = [], []
 for _ in range(50):
-    arrays.append(np.ones(500_000))
+    arrays.append(np.ones(600_000))
     small.append(np.ones(500))  # what is left between them
 before = resident_mb()
 del arrays
@@ -83,5 +83,5 @@ def test_freed_arrays_go_back_to_the_system():
         done = subprocess.run([sys.executable, "-c", HOLES, how], env=plain, capture_output=True, text=True, check=True)
         return float(done.stdout)
 
-    assert freed_mb("returned") > 190.0  # of 200
+    assert freed_mb("returned") > 230.0  # of 240
     assert freed_mb("as it is") < 100.0  # else there is nothing to ask for
