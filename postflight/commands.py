@@ -8,6 +8,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -198,45 +199,46 @@ def run_flight(
 
         return step
 
-    with progress_bar() as report:
-        flight = asked_for.of(read_flight(folder, steps(report)(0.0, 0.05)))
-    stages.end("reading telemetry")
-    settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
-    if flight.changes:
-        settings["changes"] = list(flight.changes)
     return_large_arrays()  # a reconciliation's, made anew at every step, would cost more time than they are worth
-    new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
-    with new as out, SecondProcess(out.path / "figures") as second:
+    with SecondProcess(draws=True) as second:
         with progress_bar() as report:
-            bet, answers = _answered(flight, methods, steps(report), stages, second)
-        event_rows = run_folder.event_table(bet, bet.table)
-        show_answers(bet, answers, event_rows)
-        stages.end("printing the answers")
-        second.draw_deflections(answers)  # not sooner: to hand them over takes a moment
-        with progress_bar() as report:
-            step = steps(report)
-            answers = with_increments(answers)
-            stages.end("aerodynamic increments")
-            bounds, reran = _write_rest(out, bet, answers, reruns, step)
-            second.draw_studies(bounds, reran, answers.increments)
-            stages.end("bounds of the rigid vehicle")
-            run_folder.write_reconstruction(out, bet, answers)
-            run_folder.write_answers(out, answers)
-            out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-            stages.end("tables")
-            step(0.9, 1.0)(0.0, "drawing, and writing the report")
-            lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
-            (out.path / "log.jsonl").write_text(lines)
-            out.write_facts()
-            write_report(folder, out.path, flight.telemetry)
-            stages.end("report")
-            second.finish()
-            stages.end("figures that were not drawn meanwhile")
+            flight = asked_for.of(read_flight(folder, steps(report)(0.0, 0.05)))
+        stages.end("reading telemetry")
+        settings = {"methods": list(methods), "output_rate_hz": flight.settings.output_rate_hz, "sensitivity": reruns}
+        if flight.changes:
+            settings["changes"] = list(flight.changes)
+        new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
+        with new as out, closing(second):
+            with progress_bar() as report:
+                bet, answers = _answered(flight, methods, out.path / "figures", steps(report), stages, second)
+            event_rows = run_folder.event_table(bet, bet.table)
+            show_answers(bet, answers, event_rows)
+            stages.end("printing the answers")
+            second.draw_deflections(answers)  # not sooner: to hand them over takes a moment
+            with progress_bar() as report:
+                step = steps(report)
+                answers = with_increments(answers)
+                stages.end("aerodynamic increments")
+                bounds, reran = _write_rest(out, bet, answers, reruns, step)
+                second.draw_studies(bounds, reran, answers.increments)
+                stages.end("bounds of the rigid vehicle")
+                run_folder.write_reconstruction(out, bet, answers)
+                run_folder.write_answers(out, answers)
+                out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
+                stages.end("tables")
+                step(0.9, 1.0)(0.0, "drawing, and writing the report")
+                lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
+                (out.path / "log.jsonl").write_text(lines)
+                out.write_facts()
+                write_report(folder, out.path, flight.telemetry)
+                stages.end("report")
+                second.finish()
+                stages.end("figures that were not drawn meanwhile")
     return bet, answers, out.path
 
 
 def _answered(
-    flight: Flight, methods: tuple[str, ...], step: Callable[[float, float], Progress], stages: Stages,
+    flight: Flight, methods: tuple[str, ...], figures: Path, step: Callable[[float, float], Progress], stages: Stages,
     second: SecondProcess,
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
     """Trajectory, given to be drawn, and deflections; a camera without video is among the methods that were refused."""
@@ -247,7 +249,7 @@ def _answered(
         second.read_film(flight)
     bet = reconstruct(flight, None, step(0.05, 0.7))
     stages.end("trajectory")
-    second.draw_trajectory(bet)
+    second.draw_trajectory(bet, figures)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
     answers = estimate(bet, wanted, step(0.7, 1.0), second.film)
     stages.end("deflections")

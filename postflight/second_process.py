@@ -6,6 +6,9 @@ Figures take as much processor time as the trajectory, and nothing waits for the
 takes a quarter of it, and needs no trajectory. The process is started early, so that it has matplotlib loaded when
 there is something to draw, and is given each part of the figures as soon as its numbers are there. It ends with the
 process that started it, however that ends. Where it cannot be started, or is killed, what is missing is done here.
+
+Where nothing runs beside the command yet, it is a fork: what a program loads takes longer than a film. Later a fork
+would copy locks that other threads hold, and the program is loaded anew.
 """
 
 from __future__ import annotations
@@ -35,22 +38,24 @@ if TYPE_CHECKING:  # the process decides first how pandas is loaded
     from postflight.reconstruction import Reconstruction
     from postflight.studies.preflight import Bounds
 
-Process = multiprocessing.get_context("spawn").Process  # a fork would copy locks that other threads hold
+_THREADS = Path("/proc/self/task")  # of this process, those of libraries too; of Linux alone
 _Part = Literal["trajectory", "deflections", "studies"]  # functions draw_... of `postflight.plots.run_figures`
 _Warnings = list[tuple[type[Warning], str]]
 
 
 class SecondProcess:
-    """A process that works beside this one: use as a context, inside that of the folder it draws into.
+    """A process that works beside this one: use as a context, best before any thread is started.
+
+    `close` it before the folder that it draws into is left.
 
     Parameters
     ----------
-    figures : Path, optional
-        Folder of the figures, where some are to be drawn.
+    draws : bool
+        Whether it will draw: it makes ready for that.
     """
 
-    def __init__(self, figures: Path | None = None) -> None:
-        self._figures, self._draws = figures or Path(), figures is not None
+    def __init__(self, draws: bool = False) -> None:
+        self._draws, self._figures = draws, Path()
         self._asked: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         self._flight: Reconstruction | None = None
         self._drawing: list[tuple[_Part, tuple[Any, ...]]] = []
@@ -59,7 +64,10 @@ class SecondProcess:
     def __enter__(self) -> SecondProcess:
         """Start it."""
         self._here, there = multiprocessing.Pipe()
-        self._process = Process(target=_serve, args=(there, self._figures, self._draws), daemon=True)
+        forks = _THREADS.is_dir() and len(list(_THREADS.iterdir())) == 1
+        context: Any = multiprocessing.get_context("fork" if forks else "spawn")  # without a type for both
+        other_end = self._here if forks else None
+        self._process = context.Process(target=_serve, args=(there, other_end, self._draws), daemon=True)
         with contextlib.suppress(OSError):
             self._process.start()
         there.close()
@@ -68,6 +76,10 @@ class SecondProcess:
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
         """End it, also in the middle of its work."""
+        self.close()
+
+    def close(self) -> None:
+        """End it, also in the middle of its work; once it has ended, do nothing."""
         if self._process.pid is not None:
             self._process.terminate()
             self._process.join()
@@ -104,10 +116,10 @@ class SecondProcess:
         _warn(found[1])
         return found[0]
 
-    def draw_trajectory(self, flight: Reconstruction) -> None:
-        """Let it draw the trajectory."""
-        self._flight = flight
-        self._send(("flight", (flight,)))
+    def draw_trajectory(self, flight: Reconstruction, figures: Path) -> None:
+        """Let it draw the trajectory into a folder, as all that follows."""
+        self._flight, self._figures = flight, figures
+        self._send(("flight", (flight, figures)))
         self._draw("trajectory")
 
     def draw_deflections(self, answers: Deflections) -> None:
@@ -192,20 +204,24 @@ def _film(flight: Flight) -> FilmFit | None:
         return None
 
 
-def _serve(connection: Connection, figures: Path, draws: bool) -> None:
+def _serve(connection: Connection, other_end: Connection | None, draws: bool) -> None:
     """Be ready, do what is asked in its order, and send back what came of it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has the command's own
+    if other_end is not None:  # a fork's copy: with it open, the end of the other process would not be seen
+        other_end.close()
     leave_arrow_out()
     if draws:  # of a reconciliation's arrays `return_large_arrays` is no use
         return_large_arrays()
     flight: Reconstruction | None = None
+    figures = Path()
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
             if draws and not connection.poll():
                 import postflight.plots.run_figures  # noqa: F401 - makes ready while nothing is asked
             kind, arguments = connection.recv()
             if kind == "flight":
-                (flight,) = arguments
+                flight, figures = arguments
             elif kind == "work":
                 connection.send(_answered(*arguments))
             else:

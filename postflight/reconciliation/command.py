@@ -151,7 +151,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
     if sampled:
         require_samplers()
-    with progress_bar() as report, SecondProcess() as second:
+    with SecondProcess() as second, progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")

@@ -3,6 +3,7 @@
 import importlib
 import os
 import signal
+import subprocess
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,7 @@ def draw_here(monkeypatch):
 
 
 def all_parts(process):
-    process.draw_trajectory("flight")
+    process.draw_trajectory("flight", FOLDER)
     process.draw_deflections(Deflections(bet="flight"))
     process.draw_studies(1, 2, 3)
 
@@ -35,7 +36,7 @@ def drawn(done):
 
 def test_a_killed_process_costs_no_figure(monkeypatch):
     done = draw_here(monkeypatch)
-    with second_process.SecondProcess(FOLDER) as process:
+    with second_process.SecondProcess(draws=True) as process:
         process.read_film("flight")
         os.kill(process._process.pid, signal.SIGKILL)
         process._process.join()
@@ -51,8 +52,8 @@ def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
     def refused(_self):
         raise OSError(11, "Resource temporarily unavailable")
 
-    monkeypatch.setattr("multiprocessing.context.SpawnProcess.start", refused)
-    with second_process.SecondProcess(FOLDER) as process:
+    monkeypatch.setattr("multiprocessing.process.BaseProcess.start", refused)
+    with second_process.SecondProcess(draws=True) as process:
         all_parts(process)
         process.finish()
     assert drawn(done)
@@ -60,8 +61,8 @@ def test_a_process_that_cannot_start_costs_no_figure(monkeypatch):
 
 def test_leaving_early_ends_the_process_whatever_it_was_given():
     """Also where it has not begun to read: more than a pipe holds is on its way."""
-    with second_process.SecondProcess(FOLDER) as process:
-        process.draw_trajectory(bytes(10_000_000))
+    with second_process.SecondProcess(draws=True) as process:
+        process.draw_trajectory(bytes(10_000_000), FOLDER)
         assert process._process.is_alive()
     assert not process._process.is_alive()
 
@@ -93,11 +94,28 @@ def arrow():
     return before
 
 
-def test_pandas_is_loaded_without_arrow_which_stays_at_hand():
+def test_pandas_is_loaded_without_arrow_which_stays_at_hand(monkeypatch):
     pytest.importorskip("pyarrow", reason="pyarrow comes with the parquet extra")
+    monkeypatch.setattr(second_process, "_THREADS", Path("nowhere"))  # a fork has what is loaded here
     with second_process.SecondProcess() as process:
         process.ask(arrow)
         assert process.answer() == (False, [False, True])
+
+
+KILLED = """
+import os, signal, sys
+from postflight.second_process import SecondProcess
+
+process = SecondProcess().__enter__()
+print(type(process._process).__name__, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_a_fork_ends_with_the_process_that_was_killed():
+    done = subprocess.run([sys.executable, "-c", KILLED], capture_output=True, text=True, timeout=60)
+    assert done.stdout == "ForkProcess\n"  # after its end: it holds the other side of this pipe
 
 
 def test_what_a_killed_process_was_asked_for_is_done_here():
@@ -126,7 +144,7 @@ class Silent:
 @pytest.fixture
 def answering():
     def with_answers(*says):
-        process = second_process.SecondProcess(FOLDER)
+        process = second_process.SecondProcess(draws=True)
         process._here, process._sender = Silent(*says), ThreadPoolExecutor(1)
         all_parts(process)
         return process
