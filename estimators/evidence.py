@@ -182,7 +182,7 @@ def delayed(loads: FlightLoads, force_s: float, rate_s: float) -> FlightLoads:
         return loads
 
     def later(values: FloatArray, late_s: float) -> FloatArray:
-        return np.asarray(values + late_s * CubicSpline(t, values)(t, 1))
+        return values if late_s == 0.0 else np.asarray(values + late_s * CubicSpline(t, values)(t, 1))
 
     force, flow = loads.specific_force_body_mps2, loads.flow_yz_rad
     rate, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
