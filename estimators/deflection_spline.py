@@ -152,7 +152,7 @@ class Solution:
         """Covariance (n, 2, 2) of the lateral vectors at rows (n, m) of the spline."""
         moved = np.stack([value @ self.by_input[axis::2] for axis in range(2)], axis=1)
         # one product for all times: many of two rows each take much longer
-        spread = (moved.reshape(-1, len(self.inputs)) @ self.inputs).reshape(moved.shape)
+        spread = (moved.reshape(2 * len(moved), len(self.inputs)) @ self.inputs).reshape(moved.shape)
         cov = spread @ moved.transpose(0, 2, 1)
         for i in range(2):
             for j in range(2):

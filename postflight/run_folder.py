@@ -165,9 +165,13 @@ class RunFolder:
         with (self.path / name).open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(written)
+            numbers = written.shape[1] > 1 and bool((written.dtypes == np.float64).all())
             for first in range(0, len(written), _ROWS):  # as text a trajectory would be 40 MB
-                columns = (column for _, column in written[first : first + _ROWS].items())
-                writer.writerows(zip(*map(_cells, columns), strict=True))
+                rows = written[first : first + _ROWS]
+                if numbers:
+                    file.write(_lines(rows.to_numpy()))
+                else:
+                    writer.writerows(zip(*(_cells(column) for _, column in rows.items()), strict=True))
 
     def write_json(self, name: str, value: Any) -> None:
         """Write one JSON object; NaN becomes null."""
@@ -187,6 +191,12 @@ def plain_text(table: pd.DataFrame) -> pd.DataFrame:
         return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
     return table.assign(**{name: table[name].map(neutral) for name in texts})
+
+
+def _lines(values: FloatArray) -> str:
+    """Rows of numbers as `_cells` and `csv` write them, in one operation, which takes less than half the time."""
+    line = ",".join([DIGITS] * values.shape[1]) + "\n"
+    return (line * len(values) % tuple(values.ravel().tolist())).replace("nan", "")
 
 
 def _cells(column: pd.Series) -> list[Any]:
