@@ -201,8 +201,18 @@ def stamp(figure: Figure, telemetry: Telemetry, changes: tuple[str, ...] = ()) -
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG whose bytes depend on the picture alone."""
-    figure.savefig(path, dpi=_DPI, metadata={"Software": None})
+    """Write a PNG whose bytes depend on the picture alone.
+
+    As `savefig` does, which draws every figure once more in vain to lay it out.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure.set_dpi(_DPI)
+    canvas, layout = FigureCanvasAgg(figure), figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure)
+        figure.set_layout_engine("none")
+    canvas.print_png(path, metadata={"Software": None})
 
 
 class FigureWarning(RuntimeWarning):
