@@ -70,7 +70,7 @@ _LINE, _LINE_SEEN, _AROUND_PX, _LINE_BESIDE_PX = 0.8, 0.1, 9, 8
 _LEAST_FRAMES = 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # one object is itself: what is found of it can be looked up by it
 class Frames:
     """Onboard video; decoded only when asked for.
 

@@ -366,7 +366,7 @@ class VehicleFile(Section):
         return self
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # as `flightmodel.film.Frames`
 class Vehicle:
     """A vehicle as flown or as assumed; every part frozen. See `vehicle_from_toml`."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -125,6 +126,7 @@ def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress
     )
 
 
+@lru_cache(maxsize=4)  # a run's pictures ask for it four times
 def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
     """Camera oriented on the benchmark frame of a film, with what an analyst decided about it.
 
