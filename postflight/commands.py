@@ -251,7 +251,7 @@ def _answered(
     stages.end("trajectory")
     second.draw_trajectory(bet, figures)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-    answers = estimate(bet, wanted, step(0.7, 1.0), second.film)
+    answers = estimate(bet, wanted, step(0.7, 1.0), second.camera)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from estimators.camera import FilmFit, sensitivity_table
+from estimators.camera import sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress
@@ -22,6 +22,7 @@ from postflight.reconstruction import Reconstruction
 from recon.consistency import ConsistencyCheck
 
 METHODS = ("camera", "misalignment", "trim", "fused")
+_AS_RUN = ("misalignment", "trim", "camera", "fused")
 NO_COMMON_ANSWER = ("inputs-far-off", "fusion-not-converged", "camera-time-bias", "deflection-undetermined")
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
@@ -232,22 +233,22 @@ def estimate(
     flown: Flight | Reconstruction,
     methods: tuple[str, ...],
     progress: Progress | None = None,
-    film: Callable[[], FilmFit | None] = lambda: None,
+    seen: Callable[[], CameraAnswer | None] = lambda: None,
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone. What ``film`` returns is taken for what the one
-    camera's film shows; without it the film is read.
+    A `Flight` without a trajectory has an answer of the camera alone. What ``seen`` returns is taken for the camera's
+    answer, and waited for while other methods run; without it the film is read.
     """
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
     answers = Deflections(bet=bet)
     fused, filmed = None, None
-    for k, method in enumerate(methods):
+    for k, method in enumerate(sorted(methods, key=_AS_RUN.index)):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                filmed = camera_answer(flight, bet, _part(report, k, len(methods)), film())
+                filmed = seen() or camera_answer(flight, bet, _part(report, k, len(methods)))
                 history = filmed.history
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
@@ -257,8 +258,8 @@ def estimate(
                 history = estimate_trim(bet)
             else:
                 # the fusion estimates the deflection at the benchmark itself
-                seen = filmed is not None and "camera" in answers.histories
-                camera = filmed.plain if filmed is not None and seen else _camera_for_fusion(flight, answers.refused)
+                used = filmed is not None and "camera" in answers.histories
+                camera = filmed.plain if filmed is not None and used else _camera_for_fusion(flight, answers.refused)
                 time_bias_s = min((film.time_bias_sd_s for film in flight.telemetry.films.values()), default=0.0)
                 fused = fuse_flight(bet.required_loads(), camera, time_bias_s)
                 history = fused.fused.history
@@ -274,7 +275,9 @@ def estimate(
         else:
             answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
-    return replace(answers, fused=fused, camera=filmed)
+    histories = {m: answers.histories[m] for m in methods if m in answers.histories}
+    refused = {m: answers.refused[m] for m in methods if m in answers.refused}
+    return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed)
 
 
 def with_increments(answers: Deflections) -> Deflections:

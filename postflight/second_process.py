@@ -1,4 +1,4 @@
-"""What does a second process do for a command? It reads the film while the first reconstructs, then draws the figures.
+"""What does a second process do for a command? It has the camera's answer while the first reconstructs, then draws.
 
 Of a reconciliation it does what does not need the fit.
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:  # the process decides first how pandas is loaded
     from estimators.camera import FilmFit
     from postflight.aero_increments import AeroIncrements
     from postflight.deflections import Deflections
+    from postflight.filming import CameraAnswer
     from postflight.flight import Flight
     from postflight.reconstruction import Reconstruction
     from postflight.studies.preflight import Bounds
@@ -87,13 +88,13 @@ class SecondProcess:
         self._here.close()
 
     def read_film(self, flight: Flight) -> None:
-        """Let it read the film of a flight's one camera (`camera_film`)."""
+        """Let it read the film of a flight's one camera; with the trajectory it then has the camera's answer."""
         self._reading = True
         self._send(("film", (flight,)))
 
-    def film(self) -> FilmFit | None:
-        """What the film shows, once it is read; None where that was not asked for or could not be done."""
-        found: FilmFit | None = None
+    def camera(self) -> CameraAnswer | None:
+        """What the camera answers, once it does; None where that was not asked for or could not be done."""
+        found: CameraAnswer | None = None
         if self._reading:
             self._reading = False
             with contextlib.suppress(EOFError, OSError):
@@ -117,9 +118,11 @@ class SecondProcess:
         return found[0]
 
     def draw_trajectory(self, flight: Reconstruction, figures: Path) -> None:
-        """Let it draw the trajectory into a folder, as all that follows."""
+        """Let it draw the trajectory into a folder, as all that follows; the camera's answer comes first."""
         self._flight, self._figures = flight, figures
         self._send(("flight", (flight, figures)))
+        if self._reading:
+            self._send(("camera", ()))
         self._draw("trajectory")
 
     def draw_deflections(self, answers: Deflections) -> None:
@@ -140,7 +143,7 @@ class SecondProcess:
         OSError
             Where it could not write a file.
         """
-        self.film()
+        self.camera()
         for part, arguments in self._drawing:
             try:
                 found: _Warnings | OSError = self._here.recv()
@@ -204,6 +207,17 @@ def _film(flight: Flight) -> FilmFit | None:
         return None
 
 
+def _camera(bet: Reconstruction | None, film: FilmFit | None) -> CameraAnswer | None:
+    """What the camera answers with a trajectory; None as of `_film`."""
+    from flightmodel.checks import GateError
+    from postflight.filming import camera_answer
+
+    try:
+        return None if bet is None or film is None else camera_answer(bet.flight, bet, film=film)
+    except (GateError, OSError):
+        return None
+
+
 def _serve(connection: Connection, other_end: Connection | None, draws: bool) -> None:
     """Be ready, do what is asked in its order, and send back what came of it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
@@ -213,6 +227,7 @@ def _serve(connection: Connection, other_end: Connection | None, draws: bool) ->
     leave_arrow_out()
     if draws:  # of a reconciliation's arrays `return_large_arrays` is no use
         return_large_arrays()
+    film: FilmFit | None = None
     flight: Reconstruction | None = None
     figures = Path()
     with contextlib.suppress(EOFError, BrokenPipeError):
@@ -220,9 +235,11 @@ def _serve(connection: Connection, other_end: Connection | None, draws: bool) ->
             if draws and not connection.poll():
                 import postflight.plots.run_figures  # noqa: F401 - makes ready while nothing is asked
             kind, arguments = connection.recv()
-            if kind == "flight":
+            if kind == "film":
+                film = _film(*arguments)
+            elif kind == "flight":
                 flight, figures = arguments
             elif kind == "work":
                 connection.send(_answered(*arguments))
             else:
-                connection.send(_film(*arguments) if kind == "film" else _drawn(kind, flight, figures, arguments))
+                connection.send(_camera(flight, film) if kind == "camera" else _drawn(kind, flight, figures, arguments))

@@ -41,7 +41,7 @@ def test_a_killed_process_costs_no_figure(monkeypatch):
         os.kill(process._process.pid, signal.SIGKILL)
         process._process.join()
         all_parts(process)
-        assert process.film() is None
+        assert process.camera() is None
         process.finish()
     assert drawn(done)
 
@@ -169,8 +169,8 @@ def test_what_a_process_that_died_amid_its_work_did_not_draw_is_drawn_here(answe
 
 
 def test_the_film_is_what_comes_first(answering):
-    process = answering("what it shows", [], [], [])
+    process = answering("what it answers", [], [], [])
     process._reading = True
-    assert process.film() == "what it shows"
-    assert process.film() is None
+    assert process.camera() == "what it answers"
+    assert process.camera() is None
     process.finish()
