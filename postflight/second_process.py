@@ -65,10 +65,7 @@ class SecondProcess:
     def __enter__(self) -> SecondProcess:
         """Start it."""
         self._here, there = multiprocessing.Pipe()
-        forks = _THREADS.is_dir() and len(list(_THREADS.iterdir())) == 1
-        context: Any = multiprocessing.get_context("fork" if forks else "spawn")  # without a type for both
-        other_end = self._here if forks else None
-        self._process = context.Process(target=_serve, args=(there, other_end, self._draws), daemon=True)
+        self._process = _made(there, self._here, self._draws)
         with contextlib.suppress(OSError):
             self._process.start()
         there.close()
@@ -161,6 +158,13 @@ class SecondProcess:
     def _send(self, what: Any) -> None:
         # where nobody receives, those who wait for an answer find out
         self._sender.submit(self._here.send_bytes, ForkingPickler.dumps(what))
+
+
+def _made(there: Connection, here: Connection, draws: bool) -> Any:
+    """The process, not started yet: a fork where this thread is the only one."""
+    forks = _THREADS.is_dir() and len(list(_THREADS.iterdir())) == 1
+    context: Any = multiprocessing.get_context("fork" if forks else "spawn")  # there is no type for both
+    return context.Process(target=_serve, args=(there, here if forks else None, draws), daemon=True)
 
 
 def _warn(given: _Warnings) -> None:

@@ -163,7 +163,6 @@ def _camera() -> None:
         raise GateError(fit.refused, code="kernels-not-called")
 
 
-# the longest to compile first: they are dealt out to processes in this order
 GROUPS: dict[str, Callable[[], None]] = {
     "filter": _filter,
     "camera": _camera,
@@ -175,6 +174,10 @@ GROUPS: dict[str, Callable[[], None]] = {
     "tables": _tables,
     "spans": _spans,
 }
+# what shares its parts: in one process these are compiled once. The longest first: they are dealt out in this order
+_FAMILIES = (
+    ("filter", "smoothers"), ("camera",), ("simulator", "ensembles", "creep"), ("balance",), ("spans",), ("tables",),
+)  # fmt: skip
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
 
@@ -208,7 +211,7 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
     report(f"compiling kernels for this machine, once (a quarter of a minute to one minute): {', '.join(wanted)}")
     quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
     plain = {**os.environ, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # numba colours thousands that it drops
-    shares = _shares(sorted(wanted, key=[*GROUPS, *wanted].index), len(os.sched_getaffinity(0)))
+    shares = _shares(wanted, len(os.sched_getaffinity(0)))
     running = [
         subprocess.Popen(
             [*command, *share], env=plain, stdin=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -231,11 +234,14 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
 
 
 def _shares(groups: list[str], processes: int) -> list[list[str]]:
-    """Deal groups, the longest first, back and forth."""
-    shares: list[list[str]] = [[] for _ in range(min(processes, len(groups)))]
-    for k, group in enumerate(groups):
+    """Deal groups, family by family, back and forth; what is in none is a family of its own."""
+    known = {group for family in _FAMILIES for group in family}
+    families = [*([g for g in family if g in groups] for family in _FAMILIES), *([g] for g in groups if g not in known)]
+    families = [family for family in families if family]
+    shares: list[list[str]] = [[] for _ in range(min(processes, len(families)))]
+    for k, family in enumerate(families):
         turn, place = divmod(k, len(shares))
-        shares[place if turn % 2 == 0 else -1 - place].append(group)
+        shares[place if turn % 2 == 0 else -1 - place] += family
     return shares
 
 

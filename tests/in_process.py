@@ -25,7 +25,7 @@ def draw_here(monkeypatch: pytest.MonkeyPatch) -> None:
         def start(self) -> None:
             raise OSError("not started by tests")
 
-    monkeypatch.setattr(second_process, "Process", NoProcess)
+    monkeypatch.setattr(second_process, "_made", lambda *_: NoProcess())
 
 
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:
