@@ -107,8 +107,10 @@ def kill_one(folder, chunks, cluster_pids):
 
 def on_dask(path, folder, flights, workers):
     """Fly a study on so many local Dask workers, one of which is killed; what it took, and the workers' peak, MiB."""
+    import dask
     from distributed import Client, LocalCluster
 
+    dask.config.set({"distributed.worker.profile.enabled": False})  # as docs/monte-carlo.md begins workers
     with (
         LocalCluster(workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
         Client(cluster, set_as_default=False) as client,

@@ -44,7 +44,7 @@ from postflight.montecarlo.bands import (
     write_chunk,
 )
 from postflight.montecarlo.study import Stop, Study, read_study, run_trials, sobol_study, whole_trial
-from postflight.streams import THREAD_VARIABLES, pin_threads
+from postflight.streams import THREAD_VARIABLES, keep_arrays, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, Sequence[int]]
@@ -56,6 +56,7 @@ END_S = 5.0  # to wait for a terminated worker process
 
 def fly_chunk(study: Study, job: Job) -> Done:
     """Fly the runs of one job; a flight that fails is a row with its reason."""
+    keep_arrays()  # here, as a cluster's worker begins with settings of its own
     number, runs = job
     if study.spec.mode == "whole":
         rows = run_trials(partial(whole_trial, study.plan, study.spec.seed), study.plan, runs)
