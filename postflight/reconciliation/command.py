@@ -48,6 +48,7 @@ from postflight.reconciliation.posterior import (
 )
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
+from postflight.streams import keep_arrays
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
@@ -151,6 +152,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
     if sampled:
         require_samplers()
+    keep_arrays()
     with SecondProcess() as second, progress_bar() as report:
         report(0.0, "reading telemetry")
         telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
