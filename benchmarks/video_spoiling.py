@@ -230,7 +230,7 @@ def main() -> int:
     parser.add_argument("--footage", nargs="*", type=Path, default=[])
     parser.add_argument("--stock", type=Path, default=None, help="where the films to spoil are kept between calls")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--listed", action="store_true", help="a line for every film that is confidently wrong")
+    parser.add_argument("--listed", action="store_true", help="a line for every film that is confidently wrong or crashes")
     chosen = parser.parse_args()
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as root, ProcessPoolExecutor(chosen.processes) as pool:
@@ -246,6 +246,8 @@ def main() -> int:
             if chosen.listed and one.is_confidently_wrong:
                 print(f"  film {one.number} of {one.source}, {', '.join(one.kinds)}: {one.beyond} of {one.answered} "
                       f"frames, up to {one.error_deg:.2f} deg off with {one.sd_deg:.2f}", flush=True)  # fmt: skip
+            if chosen.listed and one.code.startswith("crashed"):
+                print(f"  film {one.number} of {one.source}, {', '.join(one.kinds)}: {one.code}", flush=True)
     shown = report(outcomes)
     print(f"{time.perf_counter() - begun:.0f} s")
     return int(shown > 0)

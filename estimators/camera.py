@@ -398,9 +398,9 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
 def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse a film of which some frames show the edge twice: its others mix pictures too, with edges closer together.
 
-    A converter of frame rates does that to a whole film.
+    A converter of frame rates does that to a whole film. Frames count that may show it twice: one alone may by chance.
     """
-    doubled = sum(getattr(fit.refused, "code", "") == "picture-doubled" for fit in fits)
+    doubled = sum(getattr(fit.refused, "code", "") == "picture-doubled" or fit.doubled > 0.0 for fit in fits)
     if doubled < max(_LEAST_MIXED, _MIXED * len(fits)):
         return fits
     words = f"{doubled} frames of the film show the edge twice: it mixes pictures, and an edge here may lie between two"

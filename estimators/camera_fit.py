@@ -27,9 +27,9 @@ from estimators.edge import (
     HorizonLine,
     breaks_across,
     fault_of_frame,
-    fault_of_second_edge,
     is_coherent,
     no_horizon,
+    second_edge,
     steepness_of,
 )
 from estimators.features import ImageFeatures, fit_feature_map, valleys
@@ -126,7 +126,7 @@ class OrientedCamera(FrameModel):
         fault = fault_of_frame(frame.image, self.view.camera.size_px) or self._fault_of_breaks(frame)
         if fault:
             return refused_fit(no_horizon(fault), fault)
-        deformation, basis, horizon = np.zeros(3), np.eye(2), _NOTHING
+        deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
         deformation[:2] = 0.0 if start is None else start
         try:
             painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
@@ -143,7 +143,7 @@ class OrientedCamera(FrameModel):
             if not horizon.is_by_hand:
                 if place is not None and not contradicted:
                     self._check_seen(horizon, last)
-                self._check_single(frame, horizon, deformation)
+                doubled = self._doubled(frame, horizon, deformation)
                 self._check_sharp(frame, horizon)
                 last = self._explained(place, deformation, last)
             if plane_axis is not None:
@@ -157,7 +157,7 @@ class OrientedCamera(FrameModel):
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except NoFitError as refusal:
             return refused_fit(horizon, refusal.faults[0])
-        return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted)
+        return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted, doubled=doubled)
 
     def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
         """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.
@@ -208,13 +208,14 @@ class OrientedCamera(FrameModel):
                 "shell-little-seen",
             )
 
-    def _check_single(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> None:
-        """Refuse a frame that shows the edge twice, by `estimators.edge`."""
+    def _doubled(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> float:
+        """Share of edge points that agree on a second edge; a frame that shows one is refused, by `estimators.edge`."""
         rows = edge_residuals(self.view, horizon, deformation).rows
         seen = np.asarray(np.isfinite(rows).all(axis=1))
-        fault = fault_of_second_edge(frame.image, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
+        share, fault = second_edge(frame.image, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
         if fault:
             raise NoFitError(fault)
+        return share
 
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
         """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""

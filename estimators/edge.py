@@ -19,15 +19,14 @@ by about 0.1 px, for `estimators.frame_solution.AprioriSd` to allow for.
 Assumed of the search from far: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this
 does not hold is refused, with the reason.
 
-A frame that shows the edge twice is two pictures mixed into one (`fault_of_second_edge`). A second edge is the first
+A frame that shows the edge twice is two pictures mixed into one (`second_edge`). A second edge is the first
 one turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a deflection. Along a line across
 every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is taken for which most points have a
 step there. The limb of the Earth, torus and shadow are steps too, but follow no turned edge far: in 435 sound frames of
 28 films, with and without the Earth, 0.4 of the points agree at the most. A ring painted or sewn round the shell does;
 it is known by the points that agree with another radius.
 
-Assumed there: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter. Of frames
-mixed from two at random that were more than 4 sd wrong, half are noticed.
+Assumed there: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter.
 """
 
 from __future__ import annotations
@@ -70,6 +69,7 @@ _NEAREST_PX, _FARTHEST_PX = 2.0, 24.0  # nearer is one edge, blurred; farther in
 _LEAST_STEP, _OF_SCATTER = 0.05, 3.0  # of the first edge's step; of the scatter of what is no step
 _ENOUGH_POINTS, _LEAST_POINTS, _LEAST_PART = 120, 30, 0.3  # looked at; that a turn moves far enough, and of all
 _DOUBLED, _BEYOND_RING = 0.55, 0.2  # a turn shares some of a ring's points, where it moves them as far
+LIKE_DOUBLED = 0.36  # a frame that may be; one of 850 sound ones of 37 films is
 _ACROSS_PX = 2.0  # on either side of an edge's middle: more of the shell has shades of its own
 
 
@@ -385,8 +385,10 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
     return float(np.sign(whole) @ (levels[:, middle + half] - levels[:, middle - half]) / np.abs(whole).sum())
 
 
-def fault_of_second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray) -> Fault:
-    """Why a frame is not one picture, with its code; empty where no second edge is seen.
+def second_edge(
+    image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
+) -> tuple[float, Fault]:
+    """Share of edge points that agree on a second edge, zero if fewer than in any sound frame; why it is two pictures.
 
     Parameters
     ----------
@@ -400,7 +402,7 @@ def fault_of_second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray
     """
     some = np.arange(len(by_turn)) % max(1, len(by_turn) // _ENOUGH_POINTS) == 0
     if some.sum() < _LEAST_POINTS:
-        return NO_FAULT
+        return 0.0, NO_FAULT
     horizon, by_turn, by_radius = horizon.some(some), by_turn[some], by_radius[some]
     reach = _FARTHEST_PX + 1.0
     lines = ScanLines(horizon.points_px, horizon.inward_px, reach, reach, horizon.line)
@@ -413,14 +415,16 @@ def fault_of_second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray
     whole = (first > 2.0 * least) & inside.all(axis=1)
     limits = (_NEAREST_PX, _FARTHEST_PX, STEP_PX, max(_LEAST_POINTS, round(_LEAST_PART * len(whole))))
     steps, by_turn = steps[whole], by_turn[whole]
-    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, (*limits, _DOUBLED))
-    if share <= _DOUBLED:
-        return NO_FAULT
+    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, (*limits, LIKE_DOUBLED))
+    if share <= LIKE_DOUBLED:
+        return 0.0, NO_FAULT
     widened, ring = np.column_stack([by_radius, np.zeros_like(by_radius)])[whole], share - _BEYOND_RING
     if _edge_kernels.share_of_second_edge(steps, widened, (*limits, ring))[0] > ring:
-        return NO_FAULT
+        return 0.0, NO_FAULT
+    if share <= _DOUBLED:
+        return share, NO_FAULT
     words = (
         f"the edge is seen twice: {100.0 * share:.0f} % of its points have a second step where a turn by "
         f"{np.rad2deg(turn_rad):.1f} deg would put it, as where two pictures were mixed into one"
     )
-    return Fault(words, "picture-doubled")
+    return share, Fault(words, "picture-doubled")

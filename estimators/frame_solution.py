@@ -127,6 +127,8 @@ class FrameFit:
         Why there is no answer; empty when there is one.
     contradicted : bool
         Whether a whole edge alone gave the answer, against the features.
+    doubled : float
+        Share of edge points that agree on a second edge; zero if usual.
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None
@@ -143,6 +145,7 @@ class FrameFit:
     horizon: HorizonLine
     refused: Fault = NO_FAULT
     contradicted: bool = False
+    doubled: float = 0.0
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
 
@@ -350,6 +353,12 @@ class FrameModel:
         found = self._fit_points(horizon, place, deformation, basis, prior)
         residual, rows, shape, weight = found.residual_px, found.rows, found.shape, found.weight
         used = weight > 0.0
+        least = min(least_points(horizon), LEAST_FEATURES)
+        if used.sum() < least:
+            raise NoFitError(
+                f"{used.sum()} edge points and features agree with one deflection where {least} are needed",
+                "edge-points-too-few",
+            )
         residual, rows, shape, weight = residual[used], rows[used], shape[used], weight[used]
         rms = float(np.sqrt(np.average(found.left_px[used] ** 2, weights=weight)))
         if rms > worst_rms_px:

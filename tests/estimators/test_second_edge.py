@@ -1,12 +1,14 @@
 """Two pictures mixed into one: seen by a second edge that is the first one turned, and by nothing else."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_mixed
-from estimators.edge import fault_of_second_edge, no_horizon
+from estimators.edge import LIKE_DOUBLED, NO_FAULT, no_horizon, second_edge
 from estimators.frame_residuals import edge_residuals
 from estimators.frame_solution import refused_fit
 from estimators.virtual_camera import DEFLECTION, RADIUS
@@ -63,14 +65,14 @@ def test_a_line_as_far_from_the_edge_everywhere_is_none(frames, oriented):
     inside = np.zeros(frames[1].shape, dtype=np.uint8)
     cv2.fillPoly(inside, [np.rint(fit.horizon.points_px + 9.0 * fit.horizon.inward_px).astype(np.int32)], 1)
     lit = np.minimum(frames[1].astype(float) * (1.0 + 0.4 * inside), 255.0).astype(np.uint8)
-    assert not fault_of_second_edge(lit, fit.horizon, by_turn, by_radius)
+    assert second_edge(lit, fit.horizon, by_turn, by_radius) == (0.0, NO_FAULT)
     # turned instead, it is one
     offset = by_turn @ np.deg2rad([1.2, -0.9])
     turned = fit.horizon.points_px + offset[:, None] * fit.horizon.inward_px
     inside[:] = 0
     cv2.fillPoly(inside, [np.rint(turned).astype(np.int32)], 1)
     lit = np.minimum(frames[1].astype(float) * (1.0 + 0.4 * inside) + 25.0 * inside, 255.0).astype(np.uint8)
-    assert fault_of_second_edge(lit, fit.horizon, by_turn, by_radius)
+    assert second_edge(lit, fit.horizon, by_turn, by_radius)[1]
 
 
 def test_a_film_of_mixed_pictures_is_no_film(frames):
@@ -88,3 +90,19 @@ def test_one_doubled_frame_of_a_long_film_is_its_own_fault():
     assert sum(bool(f.refused) for f in without_mixed([doubled, *fits])) == 1
     assert sum(bool(f.refused) for f in without_mixed([doubled] * 2 + fits)) == 2
     assert all(f.refused for f in without_mixed([doubled] * 4 + fits))
+
+
+def test_frames_that_may_be_doubled_speak_against_a_film_together():
+    """A weak second edge, of which half of the points stand out of the scatter, is in more than one frame of it."""
+    fits = answers(np.linspace(1.0, 2.0, 30))
+    weak = [replace(fit, doubled=0.45) for fit in fits[:2]]
+    assert not any(f.refused for f in without_mixed([weak[0], *fits[1:]]))
+    assert {f.refused.code for f in without_mixed([*weak, *fits[2:]])} == {"film-mixed"}
+
+
+def test_a_weak_second_edge_is_stated_by_its_share(frames, oriented):
+    """An eighth of another picture: too little to refuse the frame for, and more than one picture ever shows."""
+    fit = oriented.fit(mixed(frames[4], frames[5], 0.12))
+    assert not fit.refused
+    assert fit.doubled > LIKE_DOUBLED
+    assert oriented.fit(frames[4]).doubled == oriented.fit(frames[5]).doubled == 0.0
