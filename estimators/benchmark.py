@@ -343,7 +343,8 @@ def _check_square(
     u, v = (spots[residuals.index] - look.view.camera.centre_px).T
     by_u, by_v = residuals.rows[:, POSED][:, _CENTRE].T
     columns = 0.5 * np.column_stack([u * by_u - v * by_v, v * by_u + u * by_v])
-    information = np.diag(np.concatenate([sd**-2.0, [0.0, 0.0]]))
+    # a sd of one is no knowledge of either, and an answer where few points determine neither
+    information = np.diag(np.concatenate([sd**-2.0, [1.0, 1.0]]))
     gain, covariance, _ = huber_gain(residuals, np.column_stack([design, columns]), information, lines)
     found = (gain @ residuals.residual_px)[-2:]
     allowed = covariance[-2:, -2:] + _SQUARE_SD**2 * np.eye(2)

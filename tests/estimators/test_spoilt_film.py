@@ -14,7 +14,7 @@ from estimators.edge import WHOLE_BLUR_PX, HorizonLine, steepness_of
 from estimators.features import valleys, visible_features
 from estimators.frame_checks import Design, fault_of_fit
 from estimators.frame_edits import EditedFrame
-from estimators.frame_solution import TURN, AprioriSd, refused_fit
+from estimators.frame_solution import POSED, TURN, AprioriSd, refused_fit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.checks import Fault, GateError
@@ -180,3 +180,15 @@ def test_a_benchmark_without_any_point_is_refused_in_words(frames):
     with pytest.raises(GateError) as refusal:
         benchmark._fitted(nominal, empty, prior, AprioriSd(), np.zeros(12), (12, 8), valleys)
     assert refusal.value.codes == ("edge-points-too-few",)
+
+
+def test_points_that_say_nothing_of_the_pixels_refuse_no_benchmark(frames):
+    """Of a picture blurred by ten pixels few were found: where all lie in its middle, neither stretch nor shear shows."""
+    nominal = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
+    features = valleys(nominal)
+    look = benchmark._look(nominal, features, EditedFrame(frames[0]), 12, features.placed_m)
+    middle = np.broadcast_to(nominal.camera.centre_px, look.horizon.points_px.shape)
+    look = replace(look, horizon=replace(look.horizon, points_px=middle))
+    few = look.residuals.some(np.arange(len(look.residuals.index)) < 3)
+    sd = benchmark._prior_sd(MOUNT.uncertainty, AprioriSd())[:12]
+    benchmark._check_square(look, features, few, few.rows[:, POSED], sd)
