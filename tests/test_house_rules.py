@@ -130,6 +130,12 @@ def test_no_module_imports_itself_by_a_detour():
     assert not graph, f"circles among {sorted(graph)}"
 
 
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_users_type_checker_reads_the_annotations(package):
+    """PEP 561: of an installed package without the marker it sees no type."""
+    assert (ROOT / package / "py.typed").is_file()
+
+
 def test_no_utils():
     assert not [p for p in SOURCES if p.stem in ("utils", "helpers", "misc", "common")]
 
