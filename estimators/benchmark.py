@@ -169,10 +169,10 @@ def orient_camera(
     oriented = _oriented(nominal, frame, prior, apriori, valleys)
     if oriented.has_bad_benchmark:
         raise GateError(
-            f"benchmark frame: {100.0 * oriented.support:.0f} % of the valleys between tori are where the camera "
-            f"should see them, and the rms is {oriented.residual_rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are "
-            "usual: choose another benchmark time, or check mount, lens, shell and [cameras.NAME.uncertainty] in the "
-            "vehicle file",
+            f"benchmark frame: {100.0 * oriented.support:.0f} % of the valleys between tori and "
+            f"{100.0 * oriented.edge_in_view:.0f} % of the edge are where the camera should see them, with an rms of "
+            f"{oriented.residual_rms_px:.1f} px, {USUAL_RMS_PX:.1f} px being usual: choose another benchmark time, or "
+            "check mount, lens, shell and [cameras.NAME.uncertainty] in the vehicle file",
             code="benchmark-implausible",
         )
     # the valleys' places change with the light: they orient the camera, and measure no motion

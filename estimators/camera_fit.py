@@ -106,8 +106,10 @@ class OrientedCamera(FrameModel):
 
     @property
     def has_bad_benchmark(self) -> bool:
-        """Whether the benchmark frame shows little of the shell and its residuals are large."""
-        return self.residual_rms_px > USUAL_RMS_PX and self.support < USUAL_SHARE
+        """Whether the benchmark frame shows little of the shell and its residuals are large, or hardly any of it."""
+        if self.residual_rms_px > USUAL_RMS_PX:
+            return self.support < USUAL_SHARE
+        return max(self.support, self.edge_in_view) < _LITTLE_SEEN
 
     def fit(
         self, picture: Image | EditedFrame, plane_axis: FloatArray | None = None, start: FloatArray | None = None

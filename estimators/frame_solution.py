@@ -265,6 +265,11 @@ class FrameModel:
         """Which of the points found in the benchmark frame are the edge's, the others are features."""
         return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
 
+    @property
+    def edge_in_view(self) -> float:
+        """Share of the edge looked for that the benchmark frame shows."""
+        return float(self._benchmark_edge.sum()) / max(len(self.clocks_rad), 1)
+
     def _edge_share(self, points: int) -> float:
         """So many edge points over those of the benchmark frame; none where that shows no edge."""
         there = int(self._benchmark_edge.sum())

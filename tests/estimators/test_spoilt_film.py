@@ -192,3 +192,14 @@ def test_points_that_say_nothing_of_the_pixels_refuse_no_benchmark(frames):
     few = look.residuals.some(np.arange(len(look.residuals.index)) < 3)
     sd = benchmark._prior_sd(MOUNT.uncertainty, AprioriSd())[:12]
     benchmark._check_square(look, features, few, few.rows[:, POSED], sd)
+
+
+def test_a_benchmark_that_shows_hardly_any_of_the_shell_is_implausible(frames):
+    """A third of the edge and a third of the valleys, each point where another lens puts it: agreement by chance."""
+    plain = GEOMETRY.model_copy(update={"features": "none"})
+    oriented = orient_camera(frames[0], plain, MOUNT, JOINT_M)
+    rows = oriented.benchmark_residuals
+    little = replace(oriented, benchmark_residuals=rows.some(rows.index % 3 == 0))
+    assert replace(little, support=0.33).has_bad_benchmark
+    assert not replace(little, support=0.5).has_bad_benchmark
+    assert not replace(oriented, support=0.33).has_bad_benchmark
