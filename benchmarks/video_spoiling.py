@@ -230,7 +230,7 @@ def main() -> int:
     parser.add_argument("--footage", nargs="*", type=Path, default=[])
     parser.add_argument("--stock", type=Path, default=None, help="where the films to spoil are kept between calls")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--listed", action="store_true", help="a line for every film that is confidently wrong or crashes")
+    parser.add_argument("--listed", action="store_true", help="a line for every film confidently wrong or crashed")
     chosen = parser.parse_args()
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as root, ProcessPoolExecutor(chosen.processes) as pool:

@@ -183,7 +183,7 @@ def test_a_benchmark_without_any_point_is_refused_in_words(frames):
 
 
 def test_points_that_say_nothing_of_the_pixels_refuse_no_benchmark(frames):
-    """Of a picture blurred by ten pixels few were found: where all lie in its middle, neither stretch nor shear shows."""
+    """Of a blurred picture few were found: where all lie in its middle, neither stretch nor shear shows."""
     nominal = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
     features = valleys(nominal)
     look = benchmark._look(nominal, features, EditedFrame(frames[0]), 12, features.placed_m)
