@@ -385,9 +385,7 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
     return float(np.sign(whole) @ (levels[:, middle + half] - levels[:, middle - half]) / np.abs(whole).sum())
 
 
-def second_edge(
-    image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
-) -> tuple[float, Fault]:
+def second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray) -> tuple[float, Fault]:
     """Share of edge points that agree on a second edge, zero if fewer than in any sound frame; why it is two pictures.
 
     Parameters
