@@ -308,7 +308,7 @@ def read_film(
         if progress is not None and len(fits) % 10 == 0:
             progress(min(len(fits) / len(times), 1.0), f"frame {len(fits) + 1} of {len(times)}")
         t_s = float(times[min(len(fits), len(times) - 1)])
-        if np.array_equal(picture, before) and picture.size:
+        if _is_copy(picture, before):
             fits.append(refused_fit(no_horizon(_FROZEN), _FROZEN))
             continue
         fits.append(oriented.fit(edited(picture, edits, t_s, fixed), axis, start))
@@ -484,6 +484,12 @@ def _decoded_ahead(frames: Iterable[Image | str | Path]) -> Iterator[Image]:
         while (picture := coming.result()) is not None:
             coming = decoder.submit(following)
             yield picture
+
+
+def _is_copy(picture: Image, other: Image) -> bool:
+    """Whether two pictures are equal pixel by pixel; a few rows already differ in any others."""
+    few = slice(None, None, 64)
+    return picture.size > 0 and np.array_equal(picture[few], other[few]) and np.array_equal(picture, other)
 
 
 def _benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
