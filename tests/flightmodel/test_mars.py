@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 
 from flightmodel import earth
-from flightmodel.atmosphere import heat_ratio, standard_air, standard_sounding
+from flightmodel.atmosphere import (
+    default_sounding_sd,
+    heat_ratio,
+    standard_air,
+    standard_sounding,
+    temperature_sd,
+)
 from flightmodel.checks import GateError
 from flightmodel.config import parse_section
 from flightmodel.earth import MARS
@@ -44,6 +50,17 @@ def test_the_standard_air_is_vikings():
     assert abs(np.log(pressure[0] / 730.0)) < 2.0 * sd
     assert 4.5 < np.log10(pressure[1] / pressure[2]) < 5.5
     np.testing.assert_allclose(pressure, density * MARS.gas_jpkgk * temperature)
+
+
+def test_the_density_errs_by_what_the_temperature_does_to_the_weight_of_the_air():
+    """Temperatures alike over two scale heights: each such layer's errors add by their squares."""
+    z = np.arange(0.0, 130e3, 100.0)
+    temperature = standard_air(z, MARS)[1]
+    scale = MARS.gas_jpkgk * temperature * 3.39e6**2 / MARS.gm_m3ps2
+    part = (temperature_sd(z, MARS) / temperature / scale) ** 2 * 2.0 * scale
+    expected = np.sqrt(0.12**2 + np.cumsum(part) * 100.0)
+    stated = default_sounding_sd(z, MARS)[0]
+    np.testing.assert_allclose(stated, expected, rtol=0.15)
 
 
 def test_speed_of_sound_follows_the_heat_capacity_of_carbon_dioxide():

@@ -20,6 +20,8 @@ POLAR_M = 3376.20e3
 AREA_M2, MASS_KG = 0.25 * np.pi * 2.65**2, 585.3
 _KNOTS_M = np.array([-10e3, 0.0, 25e3, 60e3, 90e3, 130e3, 250e3])
 _LOG_RHO = np.log([3.9e-2, 1.6e-2, 1.5e-3, 1.6e-5, 1.0e-7, 5e-10, 1e-14])
+# in hydrostatic balance: 7.7 mbar at the ground; 215, 220, 212, 195, 170, 150 K at 0, 20, 40, 60, 80, 120 km
+LOG_RHO_OF_A_STORM = np.log([4.3e-2, 1.9e-2, 2.0e-3, 9.4e-5, 4.8e-6, 4.7e-8, 1e-12])
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,18 @@ C_A, C_A_SD, MASS_SD = 1.70, 0.02, 0.001
 NOISE_MPS2, BIAS_MPS2, SCALE, TRIM_DEG = 0.02, 0.03, 0.002, 2.0
 
 
-def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray = STATE, lift: float = 0.0) -> Entry:
-    """Fly an entry dispersed about a stated state and measure it; ``lift`` is a part of the drag, in any direction."""
+def fly(
+    seed: int,
+    rate_hz: float = 16.0,
+    to_s: float = 170.0,
+    state: np.ndarray = STATE,
+    lift: float = 0.0,
+    log_rho: np.ndarray = _LOG_RHO,
+) -> Entry:
+    """Fly an entry dispersed about a stated state and measure it.
+
+    ``lift`` is a part of the drag, in any direction; ``log_rho`` is of the density at its knots.
+    """
     rng = np.random.default_rng(seed)
     true_state = state + STATE_SD * rng.standard_normal(6)
     c_a = C_A * (1.0 + C_A_SD * rng.standard_normal())
@@ -81,7 +93,7 @@ def fly(seed: int, rate_hz: float = 16.0, to_s: float = 170.0, state: np.ndarray
             w[0] * np.sin(height / s) + w[1] * np.cos(height / s)
             for w, s in zip(waves.T, (4e3, 9e3, 20e3), strict=True)
         )
-        return np.exp(np.interp(height, _KNOTS_M, _LOG_RHO) + shift + 0.04 * wave)
+        return np.exp(np.interp(height, _KNOTS_M, log_rho) + shift + 0.04 * wave)
 
     def air_of(r, v):
         level = np.hypot(r[0], r[1])

@@ -210,6 +210,17 @@ def test_a_density_that_the_atmosphere_does_not_allow_is_red(tmp_path):
         assert not check().passed, new
 
 
+def test_a_dust_storm_is_not_red(tmp_path):
+    """Its air is eight times as dense as the standard's at 90 km, and density came out right beside a red check."""
+    truth = mars_entry.fly(915, to_s=110.0, log_rho=mars_entry.LOG_RHO_OF_A_STORM)
+    mars_entry.write(truth, tmp_path)
+    bet = pf.reconstruct(pf.read_flight(tmp_path))
+    assert not [check.code for check in bet.consistency_checks if not check.passed]
+    assert bet.density.density_ratio.max() > 4.0
+    true = np.exp(np.interp(bet.density.time_s, truth.time_s, np.log(truth.density_kgpm3)))
+    assert np.abs((bet.density.density_kgpm3 - true) / bet.density.density_sd_kgpm3).max() < 4.0
+
+
 def spoilt(truth, folder, rows):
     """Folder of an entry whose accelerometer's table (n, 2) is changed."""
     mars_entry.write(truth, folder)
