@@ -3,7 +3,9 @@
 A state is Cartesian, or radius (or height), latitude, longitude, speed, flight-path angle and azimuth. It goes to
 planet-fixed axes, its covariance by central differences of the whole conversion,
 
-    P_fixed = J P J^T,   J = d(position, velocity) / d(what is stated)
+    P_fixed = J P J^T + (v, g)(v, g)^T t_sd^2,   J = d(position, velocity) / d(what is stated)
+
+where the second part is what its time may err against the sensors' clock, in free fall (``v, g`` against the planet).
 
 ``axes`` says against what a velocity is: ``"fixed"``, the rotating planet; ``"inertial"``, planet-fixed axes at t0 held
 still; ``"j2000"``, ICRF (Mars alone). Latitude and longitude are always of the planet. With ``radius_m`` latitude is
@@ -36,6 +38,7 @@ class StateEntry(Section):
     """State at one time with standard deviations, or a covariance of its six numbers in their order and units."""
 
     t_s: Time
+    t_sd_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.1  # assumed: times of entry are printed to tenths
     axes: Axes
     position_m: Triple | None = None
     velocity_mps: Triple | None = None
@@ -76,7 +79,7 @@ class StateEntry(Section):
         faults: list[tuple[str, object, str]] = []
         sds = tuple(map(self._sd_key, wanted))
         for key in type(self).model_fields:
-            if key in ("t_s", "axes", "covariance"):
+            if key in ("t_s", "t_sd_s", "axes", "covariance"):
                 continue
             value = getattr(self, key)
             if key in wanted and value is None:
@@ -120,7 +123,8 @@ class StateEntry(Section):
         ]
         jacobian = np.array(moved).T / (2.0 * step)
         state = self._fixed(stated, t0_utc, planet)
-        whole = jacobian @ covariance @ jacobian.T
+        late = self.t_sd_s * _in_free_fall(state, planet)
+        whole = jacobian @ covariance @ jacobian.T + np.outer(late, late)
         return StatePrior(self.t_s, state[:3], state[3:], 0.5 * (whole + whole.T))
 
     def _fixed(self, stated: FloatArray, t0_utc: str, planet: earth.Planet) -> FloatArray:
@@ -138,6 +142,13 @@ class StateEntry(Section):
         if self.axes == "inertial":
             velocity = velocity - np.cross(planet.rate_ecef_radps, position)
         return np.concatenate([position, velocity])
+
+
+def _in_free_fall(state: FloatArray, planet: earth.Planet) -> FloatArray:
+    """Rate of change (6,) of a position and velocity in planet-fixed axes by gravitation alone."""
+    spin = planet.rate_ecef_radps
+    turning = 2.0 * np.cross(spin, state[3:]) + np.cross(spin, np.cross(spin, state[:3]))
+    return np.concatenate([state[3:], earth.gravitation(state[:3], planet) - turning])
 
 
 def fixed_axes(

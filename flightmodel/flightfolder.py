@@ -729,6 +729,8 @@ def assumed_errors(
         out[f"radars.{name}"] = _assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
     if spec.measures_deceleration and "trim_sd_deg" not in spec.motion.model_fields_set:
         out["motion"] = {"trim_sd_deg": spec.motion.trim_sd_deg}
+    if spec.start.state is not None:
+        out["start.state"] = _assumed_of(spec.start.state, set())
     prior = spec.attitude_prior
     if prior is not None and "sd_deg" not in prior.model_fields_set:
         out["attitude_prior"] = {"sd_deg": float(prior.sd_deg[0])}

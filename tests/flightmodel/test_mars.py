@@ -93,13 +93,31 @@ def entry(**changed):
 
 
 def test_a_spherical_state_comes_back():
-    prior = entry().prior(FIRST_LINES["t0_utc"], MARS)
+    prior = entry(t_sd_s=0.0).prior(FIRST_LINES["t0_utc"], MARS)
     r = prior.position_ecef_m
     v = prior.velocity_ecef_mps + np.cross(MARS.rate_ecef_radps, r)
     assert np.linalg.norm(r) == pytest.approx(3522.2e3)
     assert np.linalg.norm(v) == pytest.approx(7264.2)
     assert np.rad2deg(np.arcsin(r @ v / np.linalg.norm(r) / np.linalg.norm(v))) == pytest.approx(-14.06)
     assert np.sqrt(r @ prior.covariance[:3, :3] @ r) / np.linalg.norm(r) == pytest.approx(1500.0, rel=1e-4)
+
+
+def test_what_the_time_may_err_moves_the_state_along_its_free_fall():
+    """On which Jacobi's integral of the rotating planet stays: of the clock's part of the covariance, to first order."""
+    sound, late = (entry(t_sd_s=t).prior(FIRST_LINES["t0_utc"], MARS) for t in (0.0, 3.0))
+    added = late.covariance - sound.covariance
+    r, v = late.position_ecef_m, late.velocity_ecef_mps
+    moved = added[:, 0] / np.sqrt(added[0, 0]) * np.sign(v[0])
+    np.testing.assert_allclose(added, np.outer(moved, moved), rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(moved[:3], 3.0 * v, rtol=1e-6)
+
+    def jacobi(state):
+        turned = np.cross(MARS.rate_ecef_radps, state[:3])
+        return 0.5 * state[3:] @ state[3:] - earth.potential(state[:3], MARS) - 0.5 * turned @ turned
+
+    step = 1e-4 * moved
+    change = jacobi(np.concatenate([r, v]) + step) - jacobi(np.concatenate([r, v]) - step)
+    assert abs(change) < 1e-3 * abs(2.0 * step[3:] @ v)
 
 
 def test_a_covariance_of_the_state_says_the_same_as_its_sds():

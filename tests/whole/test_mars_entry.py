@@ -254,6 +254,26 @@ def test_a_drag_that_jumps_is_red(tmp_path, times, passed):
         assert before <= 115.0 < after < 122.0
 
 
+@pytest.mark.parametrize("late_s", [-5.0, 5.0])
+def test_a_clock_that_is_late_by_what_is_stated_is_in_the_sd_of_place(tmp_path, late_s):
+    """Nothing in the data shows it: 5 s late, places were up to 16 sd wrong with every check green."""
+    truth = mars_entry.fly(909, to_s=110.0)
+    spoilt(truth, tmp_path, lambda rows: rows + [late_s, 0.0])
+    text = (tmp_path / "flight.toml").read_text()
+    worst = {}
+    for stated_s in (0.1, 5.0):
+        (tmp_path / "flight.toml").write_text(text.replace("t_s = 0.0", f"t_s = 0.0\nt_sd_s = {stated_s}", 1))
+        path = pf.reconstruct(pf.read_flight(tmp_path)).trajectory
+        rows = np.searchsorted(path.time_s, [20.0, 60.0, 100.0])
+        t = path.time_s[rows] - late_s
+        true = np.column_stack([np.interp(t, truth.time_s, c) for c in truth.position_m.T])
+        error = path.position_ecef_m[rows] - true
+        cov = path.covariance[rows][:, :3, :3]
+        worst[stated_s] = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error).max()
+    assert worst[5.0] < chi_square_quantile(0.999, 3), worst
+    assert worst[0.1] > chi_square_quantile(0.999, 3), worst
+
+
 def test_milliseconds_as_seconds_are_refused(tmp_path):
     """Memory ran out: a row every millisecond of what was stated for seconds."""
     truth = mars_entry.fly(907, to_s=120.0)
