@@ -120,8 +120,8 @@ _MARS_TEMPERATURE = np.array(
 )  # fmt: skip
 _MARS_PRESSURE_PA = 636.0  # at height 0; over a year and over the planet's weather it swings by 15 %
 # heights m, and sd of the density's natural logarithm there: season, tide and dust about a mean of one season. What
-# `temperature_sd` does to the weight of the air below, d ln p = (g / R T) (dT / T) dz, where temperatures err alike over
-# two scale heights (assumed), on 12 % of the ground's pressure. A dust storm's air is two to three of them denser.
+# `temperature_sd` does to the weight of the air below, d ln p = (g / R T) (dT / T) dz, where temperatures err alike
+# over two scale heights (assumed), on 12 % of the ground's pressure. A dust storm's air is two to three of them denser.
 _MARS_DENSITY_SD = np.array([[0.0, 40e3, 80e3, 130e3], [0.12, 0.3, 0.7, 1.1]])
 _MARS_WIND_SD_MPS = 25.0  # of each component; assumed
 _MARS_MEAN_RADIUS_M = 3389.5e3

@@ -70,6 +70,7 @@ from flightmodel.sensor_tables import (
     read_sounding,
     read_sun,
     read_triad,
+    with_least_count,
 )
 from flightmodel.tables import GNSS_SD, Source, Spans
 from flightmodel.telemetry import (
@@ -453,6 +454,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     sounding = _sounding(gate, spec)
     drag = read_drag(gate, spec.drag) if spec.drag is not None else None
     state = _state(gate, spec)
+    if spec.measures_deceleration and (alone := triads.get("accelerometer")) is not None:
+        triads["accelerometer"], counted = with_least_count(alone)
+        gate.findings.extend(counted)
     idle = spec.motion.model == "ballistic" and not spec.measures_deceleration
     if idle and triads.get("accelerometer") and triads.get("rates"):
         words = (

@@ -586,6 +586,8 @@ LARGEST_RATE_HZ = 2000.0  # samples that come slower are used as they are
 WANTED_RATE_HZ = 1000.0  # a sine of 100 Hz, beyond structure and joint, loses 1.6 % in means of 1 ms
 STEADY = 0.99  # part of the steps that must be the usual one within a fifth
 WHOLE = 0.75  # part of a block's samples that its mean needs
+# of readings in whole counts: fewer show no pattern; more values than half the samples are no counts beyond noise
+_LEAST_LEVELS, _MOST_LEVELS = 5, 0.5
 
 
 def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
@@ -610,6 +612,31 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     )
     words = f"{len(block)} samples at {1.0 / usual:.0f} Hz, of which means of {count} are used"
     return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
+
+
+def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+    """Record whose resolution is the least count that its readings show, and a finding, where that is not stated.
+
+    Readings of a converter are whole multiples of one step. Left out are steps below the noise, which hides them.
+    """
+    step = max(map(_least_count, record.measured_sensor.T))
+    if step <= 1.1 * max(record.spec.noise_sd, record.spec.resolution):
+        return record, []
+    words = f"readings are multiples of {step:.3g} (SI), beyond noise and resolution as stated: taken for the resolution"
+    finding = Finding(record.spec.name, words, np.nan, np.nan, code="least-count")
+    return replace(record, spec=replace(record.spec, resolution=step)), [finding]
+
+
+def _least_count(column: FloatArray) -> float:
+    """Step of which nearly all differences of readings (n,) are whole multiples; 0 where there is none."""
+    known = column[np.isfinite(column)]
+    levels = np.unique(known)
+    if len(levels) < _LEAST_LEVELS or len(levels) > _MOST_LEVELS * len(known):
+        return 0.0
+    steps = np.diff(levels)
+    step = float(np.quantile(steps, 0.1))
+    whole = np.abs(steps / step - np.round(steps / step)) < 0.05  # printed to so many digits
+    return step if whole.mean() > STEADY else 0.0
 
 
 def _means(column: FloatArray, first: IntArray, least: float) -> FloatArray:

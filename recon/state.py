@@ -286,9 +286,11 @@ def imu_blocks(force: TriadSpec, rate: TriadSpec) -> list[Block]:
 def deceleration_blocks(spec: TriadSpec, trim_sd_rad: float, tracked: bool) -> list[Block]:
     """Errors of an accelerometer that measures ballistic flight's deceleration alone; the trim's with its scale.
 
-    Without a tracker the bias is considered: to first order thin air three times as dense as expected is a bias.
+    Without a tracker the bias is considered: to first order thin air three times as dense as expected is a bias. Half a
+    count is in it: counts are rounded, cut off or rounded down, and what is below the first one reads as nothing.
     """
     bias, walk = _bias(spec)
+    bias = float(np.hypot(bias, 0.5 * spec.resolution))
     return [
         Block(spec.name, ("bias",), "m/s2", max(bias, 1e-9), walk_var_per_s=walk, considered=not tracked),
         Block(spec.name, ("scale",), "1", max(float(np.hypot(spec.scale_sd, trim_sd_rad**2)), 1e-9)),

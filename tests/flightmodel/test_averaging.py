@@ -1,4 +1,4 @@
-"""Records far faster than a vehicle moves: means of blocks keep integral, noise density, gaps and missing samples."""
+"""Fast records keep integral, noise density, gaps and missing samples as means; coarse ones show their least count."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel.instruments import TriadSpec
-from flightmodel.sensor_tables import averaged
+from flightmodel.sensor_tables import averaged, with_least_count
 from flightmodel.telemetry import TriadRecord
 from tests.refusing import numbers_in
 
@@ -67,3 +67,25 @@ def test_a_rate_that_changes_leaves_the_record_alone():
     t = np.concatenate([fast.time_s, fast.time_s[-1] + slow.time_s - slow.time_s[0] + 0.005])
     given = replace(fast, time_s=t, measured_sensor=np.vstack([fast.measured_sensor, slow.measured_sensor]))
     assert averaged(given)[0] is given
+
+
+@pytest.mark.parametrize("step", [0.05, 0.3, 2.5])
+def test_readings_in_whole_counts_show_the_count(step):
+    """Printed to seven digits in another unit, as files have them; some levels are passed over."""
+    given = record(100.0)
+    counts = np.round(40.0 * given.measured_sensor / step)
+    printed = [[float(f"{x:.7g}") for x in row] for row in counts * step / 9.80665]
+    found, told = with_least_count(replace(given, measured_sensor=9.80665 * np.array(printed)))
+    assert found.spec.resolution == pytest.approx(step, rel=1e-3)
+    assert [finding.code for finding in told] == ["least-count"]
+    assert replace(found.spec, resolution=given.spec.resolution) == given.spec
+
+
+def test_noise_shows_no_count_and_a_stated_one_is_no_finding():
+    given = record(100.0)
+    fine = replace(given, measured_sensor=np.round(given.measured_sensor, 6))
+    assert with_least_count(fine) == (fine, [])
+    coarse = replace(
+        given, spec=replace(SPEC, resolution=0.3), measured_sensor=0.3 * np.round(40.0 * given.measured_sensor / 0.3)
+    )
+    assert with_least_count(coarse) == (coarse, [])

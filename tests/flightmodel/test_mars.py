@@ -103,7 +103,7 @@ def test_a_spherical_state_comes_back():
 
 
 def test_what_the_time_may_err_moves_the_state_along_its_free_fall():
-    """On which Jacobi's integral of the rotating planet stays: of the clock's part of the covariance, to first order."""
+    """Jacobi's integral of the rotating planet stays as it is: the clock's part of the covariance, to first order."""
     sound, late = (entry(t_sd_s=t).prior(FIRST_LINES["t0_utc"], MARS) for t in (0.0, 3.0))
     added = late.covariance - sound.covariance
     r, v = late.position_ecef_m, late.velocity_ecef_mps

@@ -242,6 +242,22 @@ def test_an_accelerometer_at_the_end_of_its_range_shows_no_drag(tmp_path):
     assert (span.start_s, span.end_s) == pytest.approx((beyond[0], beyond[-1]), abs=1.0)
 
 
+@pytest.mark.parametrize("cut", [np.round, np.trunc, np.floor])
+def test_a_coarse_accelerometer_shows_its_least_count(tmp_path, cut):
+    """Counts of 1 m/s^2, not stated, cut off: the speed was 9.6 sd wrong, all green."""
+    truth = mars_entry.fly(910, to_s=120.0)
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: np.column_stack([rows[:, 0], cut(rows[:, 1])])))
+    assert "least-count" in [finding.code for finding in bet.findings]
+    found, path = bet.density, bet.trajectory
+    true = np.exp(np.interp(found.time_s, truth.time_s, np.log(truth.density_kgpm3)))
+    assert np.abs((found.density_kgpm3 - true) / found.density_sd_kgpm3).max() < 4.0
+    speed = np.linalg.norm(path.velocity_ecef_mps, axis=1)
+    unit = path.velocity_ecef_mps / speed[:, None]
+    sd = np.sqrt(np.einsum("ni,nij,nj->n", unit, path.covariance[:, 3:6, 3:6], unit))
+    true = np.interp(path.time_s, truth.time_s, np.linalg.norm(truth.velocity_mps, axis=1))
+    assert np.abs((speed - true) / sd).max() < 4.0
+
+
 @pytest.mark.parametrize(("times", "passed"), [(1.0, True), (1.8, False)])
 def test_a_drag_that_jumps_is_red(tmp_path, times, passed):
     """As where a parachute opens, after which the density was several times too large and every check green."""
@@ -258,7 +274,7 @@ def test_a_drag_that_jumps_is_red(tmp_path, times, passed):
 def test_a_clock_that_is_late_by_what_is_stated_is_in_the_sd_of_place(tmp_path, late_s):
     """Nothing in the data shows it: 5 s late, places were up to 16 sd wrong with every check green."""
     truth = mars_entry.fly(909, to_s=110.0)
-    spoilt(truth, tmp_path, lambda rows: rows + [late_s, 0.0])
+    spoilt(truth, tmp_path, lambda rows: np.array([late_s, 0.0]) + rows)
     text = (tmp_path / "flight.toml").read_text()
     worst = {}
     for stated_s in (0.1, 5.0):
