@@ -622,7 +622,7 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     step = max(map(_least_count, record.measured_sensor.T))
     if step <= 1.1 * max(record.spec.noise_sd, record.spec.resolution):
         return record, []
-    words = f"readings are multiples of {step:.3g} (SI), beyond noise and resolution as stated: taken for the resolution"
+    words = f"readings are multiples of {step:.3g} (SI), more than noise and resolution state: taken for resolution"
     finding = Finding(record.spec.name, words, np.nan, np.nan, code="least-count")
     return replace(record, spec=replace(record.spec, resolution=step)), [finding]
 

@@ -198,7 +198,7 @@ def reconstruct(
     return replace(
         solution,
         consistency_checks=(*solution.consistency_checks, *at_rest),
-        findings=(*solution.findings, *rest.noise_findings(telemetry)),
+        findings=(*solution.findings, *rest.noise_findings(telemetry), *survey.unchecked_state(telemetry)),
         single_faults=faults,
     )
 
@@ -387,7 +387,8 @@ def reconstruct_once(
     held_out = held_out_table(problem, run, settings.engine)
     checks += consistency.held_out_checks(problem, held_out, settings)
     missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
-    checks += survey.place_checks(missed, settings.check_confidence)
+    tracked = bool(trackers(telemetry, settings))
+    checks += survey.place_checks(missed, settings.check_confidence, tracked)
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
     edits = consistency.edit_findings(problem, run.innovations.accepted)

@@ -25,7 +25,7 @@ import numpy as np
 from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import KnownPlace, Telemetry
+from flightmodel.telemetry import Finding, KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
 from recon.ekf import ForwardPass, Problem
@@ -36,6 +36,10 @@ from recon.state import KINEMATIC, States
 _UNITS = {"m": ("m", 1.0), "rad": ("deg", float(np.rad2deg(1.0)))}
 # single errors first; a shift to the north-west is two of them
 _HYPOTHESES = (("survey north",), ("survey east",), ("height datum",), ("north",), ("survey north", "survey east"))
+_OF_A_STATE = (
+    "check the state's axes, angles and speed, its time (t_sd_s), the accelerometer's scale and axis, rows that are "
+    "missing with their time, and the place and its time"
+)
 # of common errors where they are looked for: a mistyped minute of arc; the geoid's extremes; a declination (grid north)
 WIDE_SD = {
     f"{SITES} survey north": 2000.0,
@@ -109,9 +113,12 @@ def missed_places(
     return out
 
 
-def place_checks(misses: list[Miss], confidence: float) -> list[ConsistencyCheck]:
-    """One check for each place that is known; one that fails names the error of all sites that would explain it."""
-    causes, component = _causes(misses, confidence) if misses else ("", "")
+def place_checks(misses: list[Miss], confidence: float, tracked: bool = True) -> list[ConsistencyCheck]:
+    """One check for each place that is known; one that fails names the error of all sites that would explain it.
+
+    Without a tracker (``tracked``) it is the stated state, or what was integrated from it.
+    """
+    causes, component = (_causes(misses, confidence) if tracked else (_OF_A_STATE, "")) if misses else ("", "")
     out = []
     for miss in misses:
         away = float(np.linalg.norm(miss.residual_m))
@@ -119,7 +126,8 @@ def place_checks(misses: list[Miss], confidence: float) -> list[ConsistencyCheck
         most = chi_square_quantile(confidence, len(miss.residual_m))
         good = f"{symptom}, within the uncertainty of both"
         check = consistency_check(
-            "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes, source=SITES,
+            "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes,
+            source=SITES if tracked else "start",
             component=component,
         )  # fmt: skip
         out.append(check)
@@ -181,6 +189,15 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
         advice="check survey, height datum and azimuth mark, against the receiver or barometer that differs",
         source=SITES, component=component,
     )  # fmt: skip
+
+
+def unchecked_state(telemetry: Telemetry) -> list[Finding]:
+    """Finding where a flight without a tracker states no place: then nothing checks where it flew."""
+    state = telemetry.start.state
+    if state is None or telemetry.radars or telemetry.gnss or telemetry.places:
+        return []
+    words = "no tracker and no [[places]]: nothing checks this state, its time and axes; state where the vehicle landed"
+    return [Finding("start", words, state.time_s, state.time_s, "state-unchecked")]
 
 
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:

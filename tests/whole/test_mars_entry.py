@@ -290,6 +290,32 @@ def test_a_clock_that_is_late_by_what_is_stated_is_in_the_sd_of_place(tmp_path, 
     assert worst[0.1] > chi_square_quantile(0.999, 3), worst
 
 
+WRONG_WAYS = {
+    "west for east": ("longitude_deg = 338.0", "longitude_deg = 22.0"),
+    "axes": ('axes = "inertial"', 'axes = "fixed"'),
+    "scale": ("", ""),
+}
+
+
+@pytest.mark.parametrize("wrong", [None, *WRONG_WAYS])
+def test_the_place_of_the_landing_shows_what_nothing_else_does(tmp_path, wrong):
+    """Without a tracker and a place every check is green; then a finding says that nothing checks the state."""
+    truth = mars_entry.fly(912)
+    spoilt(truth, tmp_path, lambda rows: rows * [1.0, 0.95 if wrong == "scale" else 1.0])
+    text = (tmp_path / "flight.toml").read_text().replace(*WRONG_WAYS.get(wrong, ("", "")))
+    lat, lon, height = earth.geodetic_from_ecef(truth.position_m[-1], earth.MARS)
+    landed = (
+        f'\n[[places]]\nname = "landing"\nt_s = {truth.time_s[-1]}\nlatitude_deg = {np.rad2deg(lat):.6f}\n'
+        f"longitude_deg = {np.rad2deg(lon):.6f}\nsd_m = 1000.0\nheight_m = {height:.0f}\nheight_sd_m = 500.0\n"
+    )
+    for place, unchecked in (("", True), (landed, False)):
+        (tmp_path / "flight.toml").write_text(text + place)
+        bet = pf.reconstruct(pf.read_flight(tmp_path))
+        red = {check.code: check.source for check in bet.consistency_checks if not check.passed}
+        assert red == ({} if unchecked or wrong is None else {"place": "start"})
+        assert ("state-unchecked" in [finding.code for finding in bet.findings]) == unchecked
+
+
 def test_milliseconds_as_seconds_are_refused(tmp_path):
     """Memory ran out: a row every millisecond of what was stated for seconds."""
     truth = mars_entry.fly(907, to_s=120.0)
