@@ -37,6 +37,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
+from flightmodel import earth
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
@@ -62,6 +63,8 @@ _BALLISTIC_CHECKS = {
         "is beyond the pre-flight uncertainty: check mass, area and coefficients",
     ),
 }
+_LEAST_QUIET = 20  # readings: a second of them
+_MOST_FELT = 3.0  # beyond it the drag hides a bias that the check should show
 _MOST_OUTSIDE = 3.0  # sd beyond a physical range
 _ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
@@ -284,6 +287,49 @@ def source_checks(problem: Problem, innovations: Innovations, confidence: float)
         checks.append(edit_check(instrument.name, innovations.accepted[mine]))
         out += [replace(v, source=instrument.owner) for v in checks]
     return out
+
+
+def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list[ConsistencyCheck]:
+    """Whether an accelerometer that the drag follows reads its bias, as stated, before the air is felt.
+
+    Of a bias that is only considered, without a tracker, nothing else shows that it is larger: the drag takes it. Air
+    may be denser than stated by twice its sd; what is beyond that drag is the bias. None where the data begin in air
+    whose drag is larger than `_MOST_FELT` of the bias's sd.
+    """
+    out = []
+    for number, instrument in enumerate(problem.instruments):
+        rows = np.flatnonzero((problem.observed.source == number) & problem.observed.usable)
+        bias = problem.model.column(instrument.owner, "bias")
+        if instrument.kind != DECELERATION or not problem.model.wander.considered[bias] or len(rows) < _LEAST_QUIET:
+            continue
+        bias_sd, most = float(problem.model.prior_sd[bias]), _most_drag(problem, run.states()[problem.node[rows]])
+        quiet = rows[: max(_LEAST_QUIET, int(np.argmax(np.append(most > bias_sd, True))))]
+        drag = float(most[: len(quiet)].mean())
+        if drag > _MOST_FELT * bias_sd:
+            continue
+        mean = float(run.innovations.residual[quiet, 0].mean())
+        sd = float(np.hypot(bias_sd, np.sqrt(problem.observed.variance[quiet, 0].mean() / len(quiet))))
+        beyond = max(mean - drag, -mean, 0.0) / sd
+        found = f"before the air is felt it reads {-mean:+.2g} m/s2, {beyond:.1f} sd of its bias beyond the drag there"
+        out.append(
+            consistency_check(
+                "vacuum-reading", f"vacuum reading {instrument.owner}", beyond, 0.0,
+                float(-ndtri(0.5 * (1.0 - confidence))), found, found,
+                advice="take this mean from all readings, state a larger bias_sd, or check t_s and the unit",
+                source=instrument.owner, component="bias",
+            )
+        )  # fmt: skip
+    return out
+
+
+def _most_drag(problem: Problem, at: States) -> FloatArray:
+    """Deceleration (n,), m/s^2, of air that is denser than stated by twice its sd."""
+    motion = problem.motion
+    height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)[2]
+    row, grid = (height - motion.air_from_m) / motion.air_step_m, np.arange(len(motion.air))
+    log_density, density_sd = (np.interp(row, grid, motion.air[:, c]) for c in (0, 3))
+    density = np.exp(log_density + 2.0 * density_sd)
+    return np.asarray(0.5 * density * motion.drag_m2pkg * np.sum(at.velocity_ecef_mps**2, axis=1))
 
 
 def _measured_noise(normalised: FloatArray, measured: BoolArray, components: tuple[str, ...]) -> str:

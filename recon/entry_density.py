@@ -58,6 +58,7 @@ _LEAST_FELT = 0.2
 _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
 _APART_S, _NOISE_SPAN_S = 2, 11  # a parachute inflates within a second or two; over a few seconds noise is the same
+_WAVES = 0.14  # of density over a kilometre or two: waves of 20 K in 140 K, assumed
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
 
 
@@ -291,7 +292,8 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
 
     Means over a second are compared with those two seconds before, or before a gap, since the filter rejects the first
     readings of another drag. What the air may change between the two heights beside the stated density follows from its
-    uncertainty, of which the constant part has no share; what the readings scatter, from differences of neighbours.
+    uncertainty, of which the constant part has no share, and a climate's, wider than `_WAVES`, is of the whole profile;
+    what the readings scatter, from differences of neighbours.
     Errors of speed and height are the same at both times.
 
     Parameters
@@ -323,7 +325,8 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     before, after = whole.iloc[at[last]], whole.iloc[last]
     heights = before["height"].to_numpy(), after["height"].to_numpy()
     forgotten = 1.0 - np.exp(-np.abs(heights[1] - heights[0]) / DENSITY_LENGTH_M)
-    weather = 2.0 * (1.0 - SOUNDING_CONSTANT_PART) * forgotten * stated.at(heights[1]).density_sd ** 2
+    waves = np.minimum(np.sqrt(1.0 - SOUNDING_CONSTANT_PART) * stated.at(heights[1]).density_sd, _WAVES)
+    weather = 2.0 * forgotten * waves**2
     change = after["log_ratio"].to_numpy() - before["log_ratio"].to_numpy()
     jump = change / np.sqrt(weather + noise.to_numpy()[last] + noise.to_numpy()[at[last]])
     worst = int(np.argmax(np.abs(jump)))

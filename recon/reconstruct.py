@@ -381,6 +381,7 @@ def reconstruct_once(
     table = sensor_error_table(problem, reference, smoothed)
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
+    checks += consistency.vacuum_checks(problem, run, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += [] if phase is None else [phase.check()]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)

@@ -290,6 +290,16 @@ def test_a_clock_that_is_late_by_what_is_stated_is_in_the_sd_of_place(tmp_path, 
     assert worst[0.1] > chi_square_quantile(0.999, 3), worst
 
 
+@pytest.mark.parametrize("times", [0.0, 8.0, -8.0])
+def test_a_bias_beyond_the_data_sheet_shows_before_the_air(tmp_path, times):
+    """The drag took it: density was up to 6 sd wrong at its top, all green with what pushes forward."""
+    truth = mars_entry.fly(913, to_s=80.0)
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: np.array([0.0, times * mars_entry.BIAS_MPS2]) + rows))
+    (check,) = (one for one in bet.consistency_checks if one.code == "vacuum-reading")
+    assert check.passed == (times == 0.0)
+    assert check.source == "accelerometer"
+
+
 WRONG_WAYS = {
     "west for east": ("longitude_deg = 338.0", "longitude_deg = 22.0"),
     "axes": ('axes = "inertial"', 'axes = "fixed"'),
