@@ -351,6 +351,17 @@ def temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray
     return np.asarray(np.interp(altitude_m, [30e3, 70e3, 80e3], [1.0, 3.0, 5.0]))
 
 
+def standard_temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
+    """What a day's temperatures differ from the standard's, K (1 sd): 10 to 110 km, 30 from 120 km; of Mars as above.
+
+    Rms of NRLMSIS 2.1 less US76 between 30 and 60 deg of latitude, all seasons, hours and solar fluxes from 70 to 200:
+    6 to 13 K up to 110 km, 29 K at 120 km.
+    """
+    if planet != WGS84:
+        return temperature_sd(altitude_m, planet)
+    return np.asarray(np.interp(altitude_m, [110e3, 120e3], [10.0, 30.0]))
+
+
 def sounding_correlation(altitude_m: FloatArray, length_m: float) -> FloatArray:
     """Correlation ``(n, n)`` of a sounding's error between altitudes (n,); the length is that of density or wind."""
     return correlation(altitude_m, length_m, SOUNDING_CONSTANT_PART)
@@ -458,12 +469,13 @@ class AtmosphereProfile:
         )
 
     def temperature_sd(self, altitude_m: FloatArray) -> FloatArray:
-        """Standard deviation of the temperature, K, at geometric altitudes, m; beyond the knots the usual one."""
-        usual = temperature_sd(altitude_m, self.planet)
+        """Standard deviation of the temperature, K, at geometric altitudes, m; beyond the knots the standard's."""
         if self.temperature_sd_k is None:
-            return usual
+            own = temperature_sd(altitude_m, self.planet)
+        else:
+            own = np.interp(altitude_m, self.altitude_m, self.temperature_sd_k)
         inside = (altitude_m >= self.altitude_m[0]) & (altitude_m <= self.altitude_m[-1])
-        return np.where(inside, np.interp(altitude_m, self.altitude_m, self.temperature_sd_k), usual)
+        return np.where(inside, own, standard_temperature_sd(altitude_m, self.planet))
 
 
 def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:
@@ -479,6 +491,7 @@ def profile_from_sounding(sounding: Sounding) -> AtmosphereProfile:
         density_sd=sounding.density_sd,
         wind_sd_mps=sounding.wind_sd_mps,
         planet=sounding.planet,
+        temperature_sd_k=sounding.temperature_sd_k,
     )
 
 
@@ -502,7 +515,8 @@ def standard_sounding(planet: Planet = WGS84) -> Sounding:
     """US76 without winds in the form of a sounding, 0 to 120 km, for a flight of which no sounding was made.
 
     Density is uncertain by 10 % and each component of the wind by 15 m/s: the day's departure from the standard in
-    middle latitudes and the usual winds of the stratosphere, not an instrument's error. Of Mars, 0 to 250 km, by what
+    middle latitudes and the usual winds of the stratosphere, not an instrument's error; temperature by
+    `standard_temperature_sd`. Of Mars, 0 to 250 km, by what
     stands beside its temperatures above.
     """
     if planet != WGS84:
@@ -512,7 +526,7 @@ def standard_sounding(planet: Planet = WGS84) -> Sounding:
         z = np.arange(0.0, 120001.0, 1000.0)
         sd = np.full(len(z), 0.10), np.full(len(z), 15.0)
     still = np.zeros(len(z))
-    return Sounding(z, *standard_air(z, planet), still, still, *sd, planet)
+    return Sounding(z, *standard_air(z, planet), still, still, *sd, planet, standard_temperature_sd(z, planet))
 
 
 @cache

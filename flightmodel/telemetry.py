@@ -167,7 +167,7 @@ class Sounding:
     """Atmosphere of the day by altitude, as measured before the flight; wind is where the air goes.
 
     ``density_sd`` is a fraction of the density; sds come from the file, or from the default error model of
-    `flightmodel.atmosphere.default_sounding_sd`.
+    `flightmodel.atmosphere.default_sounding_sd`; that of the temperature is a sounding's where None.
     """
 
     altitude_m: FloatArray
@@ -179,6 +179,7 @@ class Sounding:
     density_sd: FloatArray
     wind_sd_mps: FloatArray
     planet: Planet = WGS84
+    temperature_sd_k: FloatArray | None = None
 
 
 @dataclass(frozen=True)

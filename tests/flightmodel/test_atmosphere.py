@@ -152,6 +152,16 @@ def test_the_spline_of_the_upper_tables_is_the_library_s(column, own):
     assert slope == pytest.approx(np.diff(below)[0] / 10.0, rel=1e-6)
 
 
+def test_a_day_without_a_sounding_has_temperatures_as_far_from_the_standard_as_stated():
+    """NRLMSIS of a day in August at Wallops; a sounding's own 1 to 5 K were stated of it."""
+    z = np.arange(20e3, 120e3, 5e3)
+    off = atmosphere.nrlmsis_profile().at(z).temperature_k - us76(z)[1]
+    sd = profile_from_sounding(standard_sounding()).temperature_sd(z)
+    assert 0.5 < np.sqrt(np.mean((off / sd) ** 2)) < 1.5
+    sounded = replace(standard_sounding(), temperature_sd_k=None)
+    assert np.sqrt(np.mean((off / profile_from_sounding(sounded).temperature_sd(z)) ** 2)) > 3.0
+
+
 def test_air_looked_up_again_is_the_same_to_the_last_bit():
     z = np.linspace(-500.0, 390e3, 500)
     profile = profile_from_sounding(standard_sounding())
