@@ -630,6 +630,7 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
 def _least_count(column: FloatArray) -> float:
     """Step of which nearly all differences of readings (n,) are whole multiples; 0 where there is none."""
     known = column[np.isfinite(column)]
+    known = known[np.abs(known) <= np.median(np.abs(known))] if len(known) else known  # a short pulse repeats none
     levels = np.unique(known)
     if len(levels) < _LEAST_LEVELS or len(levels) > _MOST_LEVELS * len(known):
         return 0.0

@@ -41,7 +41,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, IntArray
+from flightmodel.checks import DivergenceError, FloatArray, IntArray
 from recon import _filter_kernels
 from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps
 from recon.settings import COMPILED
@@ -74,16 +74,25 @@ def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True, eng
     """Smooth a forward pass; without covariance where only a reference trajectory is wanted.
 
     Where errors are only considered this is `two_filter`, which exists in numpy alone.
+
+    Raises
+    ------
+    DivergenceError
+        Where readings are so far from the flight that what `two_filter` factors is no longer positive definite.
     """
     kept = int(problem.kept.sum()) if with_covariance else 0
     triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
     considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
     if len(considered):
         x = run.filtered.x_minus.copy()
-        two_filter(
-            run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
-            triangles, variance,
-        )  # fmt: skip
+        try:
+            two_filter(
+                run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
+                triangles, variance,
+            )  # fmt: skip
+        except np.linalg.LinAlgError:
+            words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
+            raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
     else:
         x = run.filtered.x_plus.copy()
         backward(engine)(run.steps, run.filtered, problem.moving, x, triangles, variance)

@@ -5,9 +5,10 @@ import pytest
 
 import postflight as pf
 from flightmodel import earth
-from flightmodel.checks import GateError
+from flightmodel.checks import DivergenceError, GateError
 from flightmodel.statistics import chi_square_quantile
 from postflight.run_folder import peak_table
+from recon import smoother
 from tests.oracles import mars_entry
 from tests.refusing import numbers_in
 
@@ -324,6 +325,26 @@ def test_the_place_of_the_landing_shows_what_nothing_else_does(tmp_path, wrong):
         red = {check.code: check.source for check in bet.consistency_checks if not check.passed}
         assert red == ({} if unchecked or wrong is None else {"place": "start"})
         assert ("state-unchecked" in [finding.code for finding in bet.findings]) == unchecked
+
+
+def test_a_hypothesis_that_diverges_is_no_traceback(tmp_path, monkeypatch):
+    """Of a deceleration of m/s^2 read as g, at 12.8 km/s on Earth, one of the single faults that are tried did."""
+    truth = mars_entry.fly(914, to_s=80.0)
+    flight = spoilt(truth, tmp_path, lambda rows: rows * [1.0, 3.0])
+    usual, calls = smoother.two_filter, []
+
+    def breaking(*given):
+        calls.append(1)
+        if len(calls) > 1:
+            raise np.linalg.LinAlgError
+        return usual(*given)
+
+    monkeypatch.setattr(smoother, "two_filter", breaking)
+    assert not all(check.passed for check in pf.reconstruct(flight).consistency_checks)
+    assert len(calls) > 1
+    with pytest.raises(DivergenceError) as diverged:
+        pf.reconstruct(flight)
+    assert diverged.value.codes == ("trajectory-diverged",)
 
 
 def test_milliseconds_as_seconds_are_refused(tmp_path):
