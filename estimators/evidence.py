@@ -22,7 +22,7 @@ angle ``alpha`` from the side of the unit vector ``e``, at the rate (that of the
 
 A body that cones by 25 deg goes on by 34 deg about the flow for every turn by its own gyro, and a steady wind looks to
 the latter as one that turns. The trajectory's is a Gauss-Markov process with the correlation time
-`TRAJECTORY_TIME_S`; the wind's is half constant bias, half gravity waves along the altitude (`wind_error_root`); the
+`TRAJECTORY_TIME_S`; the wind's is constant bias, gravity waves and gusts along the altitude (`wind_error_root`); the
 density's in the dynamic pressure half constant, half Gauss-Markov with the correlation length `DENSITY_LENGTH_M`.
 
 Accelerometer and gyros have time biases of a millisecond or so: what oscillates is read late, and what the gyros carry

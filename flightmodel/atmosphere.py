@@ -104,6 +104,7 @@ SOUNDING_CONSTANT_PART = 0.5
 # vertical wavelength of the gravity waves that a wind sounding misses or met at another phase: 2 to 5 km in the lower
 # stratosphere, 10 to 30 km at the mesopause; between them, where blunt vehicles have their pressure pulse
 _WAVE_LENGTH_M = 7000.0
+_WIND_CONSTANT = 1.0 / 3.0  # of a sounded wind's variance, beside waves and gusts in equal parts
 # a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
 # period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
 _WAVE_KNOT_M = 300.0
@@ -400,14 +401,21 @@ def wave_correlation(apart_m: FloatArray) -> FloatArray:
 def wind_error_root(altitude_m: FloatArray) -> FloatArray:
     """Error ``(n, k)`` of a sounded wind component at altitudes (n,), over its sd, per unit normal.
 
-    Half of the variance is one constant, half are gravity waves (`wave_correlation`), with straight lines between knots
-    that resolve gusts into which a vehicle turns. A Gauss-Markov history over `WIND_LENGTH_M` has a third of the waves'
-    power at their own wavelength: a wave of the stated size then looks like methods that disagree.
+    A third of the variance each (assumed) is one constant, gravity waves (`wave_correlation`), and Gauss-Markov over
+    `WIND_LENGTH_M`: what the sounding smoothed or measured with noise. Straight lines join knots that resolve gusts
+    into which a vehicle turns. Without the waves, one of the stated size looks like methods that disagree: a
+    Gauss-Markov history has a third of their power at their wavelength. Without the latter, gusts below a kilometre,
+    of which waves have next to none, are taken for the flow's and C_m, a slope over it, comes out low.
     """
-    constant = np.full((len(altitude_m), 1), np.sqrt(SOUNDING_CONSTANT_PART))
-    waves = knots_root(altitude_m, _WAVE_KNOT_M, lambda knots: wave_correlation(knots[:, None] - knots))
-    size = np.sqrt(np.sum(waves**2, axis=1, keepdims=True))  # straight lines between knots are a little too small
-    return np.column_stack([constant, np.sqrt(1.0 - SOUNDING_CONSTANT_PART) / size * waves])
+    constant = np.full((len(altitude_m), 1), np.sqrt(_WIND_CONSTANT))
+
+    def both(knots: FloatArray) -> FloatArray:
+        apart = np.abs(knots[:, None] - knots)
+        return np.asarray(0.5 * (wave_correlation(apart) + np.exp(-apart / WIND_LENGTH_M)))
+
+    changing = knots_root(altitude_m, _WAVE_KNOT_M, both)
+    size = np.sqrt(np.sum(changing**2, axis=1, keepdims=True))  # straight lines between knots are a little too small
+    return np.column_stack([constant, np.sqrt(1.0 - _WIND_CONSTANT) / size * changing])
 
 
 def unresolved_variance(spacing_m: FloatArray | float, length_m: float) -> FloatArray:

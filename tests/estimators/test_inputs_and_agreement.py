@@ -116,7 +116,7 @@ def test_a_steady_wind_stays_steady_however_the_body_cones(alpha_deg):
     assert 2.1 * since * (1.0 - np.cos(np.deg2rad(25.0))) > 5.0
     change = lateral_angles(np.einsum("nji,j->ni", dcm, [1000.0, 0.6, -0.8])) - pulse.flow_yz_rad
     columns = flow_inputs(pulse)[WIND]
-    steady = np.sqrt(2.0) * columns[:, :, [0, columns.shape[2] // 2]]
+    steady = np.sqrt(3.0) * columns[:, :, [0, columns.shape[2] // 2]]
     size = np.linalg.lstsq(steady.reshape(-1, 2), change.ravel())[0]
     assert np.hypot(*size) == pytest.approx(1.0, abs=0.06)  # half of alpha / sin(alpha) - 1 at 45 deg
     left = change - steady @ size

@@ -95,10 +95,11 @@ def test_waves_have_the_spectrum_of_saturated_ones():
         assert wave_correlation(np.array([apart_m]))[0] == pytest.approx(want, abs=1e-3)
 
 
-def test_the_wind_s_error_is_a_constant_and_waves():
+def test_the_wind_s_error_is_a_constant_waves_and_gusts():
     at = 30e3 + 300.0 * np.array([4.0, 0.0, 2.0, 6.0, 1.0, 3.0, 5.0])  # on the knots, shuffled
     root = wind_error_root(at)
-    want = SOUNDING_CONSTANT_PART + (1.0 - SOUNDING_CONSTANT_PART) * wave_correlation(at[:, None] - at)
+    apart = np.abs(at[:, None] - at)
+    want = (1.0 + wave_correlation(apart) + np.exp(-apart / WIND_LENGTH_M)) / 3.0
     assert np.allclose(root @ root.T, want, atol=1e-12)
     assert np.allclose((wind_error_root(np.linspace(20e3, 60e3, 999)) ** 2).sum(axis=1), 1.0)
     # a metre of altitude, one altitude, none: still one constant and what can change

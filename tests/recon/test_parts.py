@@ -333,8 +333,8 @@ def test_readings_corrected_in_blocks_are_those_corrected_at_once(monkeypatch):
 
 @pytest.mark.parametrize("factor", [1.0, 1.5, 1.0 / 1.5])
 def test_a_jump_of_the_density_by_drag_is_counted_in_what_the_air_may_change(factor):
-    """Vertical speed 300 m/s: the half of a variance of 20 % that is forgotten over 5 km has 2 (1 - e^-0.12) of it."""
-    rng, noise, per_s, stated_sd = np.random.default_rng(5), 0.004, 20, 0.2
+    """Vertical speed 300 m/s: the half of a variance of 15 % that is forgotten over 5 km has 2 (1 - e^-0.12) of it."""
+    rng, noise, per_s, stated_sd = np.random.default_rng(5), 0.004, 20, 0.15
     time_s = 50.0 + np.arange(60 * per_s) / per_s
     log_ratio = 0.3 + noise * rng.standard_normal(len(time_s)) + np.log(factor) * (time_s >= 80.0)
     table = pd.DataFrame(
@@ -354,5 +354,10 @@ def test_a_jump_of_the_density_by_drag_is_counted_in_what_the_air_may_change(fac
         weather = stated_sd**2 * (1.0 - np.exp(-300.0 * 7.0 / 5000.0))
         gap = drag_jump_check(table[(time_s < 77.0) | (time_s > 83.0)], stated, 0.999)
         assert gap.value == pytest.approx(abs(np.log(factor)) / np.sqrt(weather + 2.0 * noise**2 / per_s), rel=0.03)
+        # a climate's uncertainty is of the whole profile: waves are no larger
+        climate = SimpleNamespace(at=lambda height_m: SimpleNamespace(density_sd=np.full(len(height_m), 0.7)))
+        weather = 2.0 * 0.14**2 * (1.0 - np.exp(-600.0 / 5000.0))
+        expected = abs(np.log(factor)) / np.sqrt(weather + 2.0 * noise**2 / per_s)
+        assert drag_jump_check(table, climate, 0.999).value == pytest.approx(expected, rel=0.02)
     # nothing to compare in a second's rows
     assert drag_jump_check(table[:per_s], stated, 0.999) is None
