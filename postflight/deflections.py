@@ -19,6 +19,7 @@ from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
+from postflight.streams import on_one_thread
 from recon.consistency import ConsistencyCheck
 
 METHODS = ("camera", "misalignment", "trim", "fused")
@@ -165,6 +166,7 @@ def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
     return np.asarray(np.maximum(middle + (between - middle) * (sd / own if own > 0.0 else 1.0), 0.0))
 
 
+@on_one_thread
 def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = None) -> DeflectionHistory:
     """Deflection from the onboard video.
 
@@ -190,6 +192,7 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
     return camera_answer(flown.flight, flown, progress).history
 
 
+@on_one_thread
 def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
     """Deflection that reconciles the accelerometers with the trajectory, seed paper eqs. [1] to [4].
 
@@ -201,6 +204,7 @@ def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
     return misalignment_history(bet.required_loads())
 
 
+@on_one_thread
 def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
     """Deflection whose c.g. offset trims the vehicle at the angle it flew, seed paper eqs. [5] and [6].
 
@@ -212,6 +216,7 @@ def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
     return trim_history(bet.required_loads())
 
 
+@on_one_thread
 def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
     """Deflection by every method that the flight has data for, and one posterior of them all.
 
@@ -294,6 +299,7 @@ def with_increments(answers: Deflections) -> Deflections:
         return replace(answers, no_increments=Fault(str(fault), fault.codes[0]))
 
 
+@on_one_thread
 def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> AeroIncrements:
     """Increments of C_A, C_N, C_m and C_mq along Mach number against the vehicle's preflight table.
 

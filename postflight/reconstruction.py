@@ -40,6 +40,7 @@ from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from postflight.flight import Flight
+from postflight.streams import on_one_thread
 from recon.atmosphere import (
     HALF_WINDOW_S,
     LEAST_AXIAL_MPS2,
@@ -247,6 +248,7 @@ class Reconstruction(Tabular):
         return "; ".join((self.flight.name, peak, passed, *self.flight.changes))
 
 
+@on_one_thread
 def reconstruct(flight: Flight, settings: Settings | None = None, progress: Progress | None = None) -> Reconstruction:
     """Reconstruct a flight: trajectory, attitude check, air data, flight loads and as-flown atmosphere.
 

@@ -11,7 +11,9 @@ import contextlib
 import os
 import sys
 import unicodedata
-from typing import Any, TextIO
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TextIO, TypeVar
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidi, zero width), half a character, line ends
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
@@ -19,6 +21,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
 _LARGE_BYTES, _HELD_BYTES = 4 << 20, 64 << 20
 _LARGEST_KEPT_BYTES = 32 << 20  # more the C library does not take
 _KEPT = {"\n", "\t"}
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 def visible(text: str) -> str:
@@ -78,6 +82,23 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 def pin_threads() -> None:
     """Limit linear algebra of this process and its children to one thread; before numpy is imported."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+
+
+def on_one_thread(work: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Let a function's linear algebra run on one thread, however it was started.
+
+    Its matrices are banded or small, and there are hundreds: two threads that wait for each other take twice as long
+    for one where nothing else runs, and hundreds of times on a busy machine.
+    """
+
+    @wraps(work)
+    def limited(*arguments: _P.args, **named: _P.kwargs) -> _R:
+        from threadpoolctl import threadpool_limits  # after what it is to find
+
+        with threadpool_limits(limits=1, user_api="blas"):
+            return work(*arguments, **named)
+
+    return limited
 
 
 def leave_arrow_out() -> None:

@@ -48,7 +48,7 @@ from postflight.reconciliation.posterior import (
 )
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
-from postflight.streams import keep_arrays
+from postflight.streams import keep_arrays, on_one_thread
 from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
@@ -128,6 +128,7 @@ class Reconciliation(Tabular):
         return f"bending stiffness {row['found']:.0f} +/- {row['sd']:.0f} N m/rad, {how}"
 
 
+@on_one_thread
 def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconciliation:
     """Find the stiffness, damping and c.g. offset with which the simulator flies like the flight.
 

@@ -203,3 +203,14 @@ def test_a_benchmark_that_shows_hardly_any_of_the_shell_is_implausible(frames):
     assert replace(little, support=0.33).has_bad_benchmark
     assert not replace(little, support=0.5).has_bad_benchmark
     assert not replace(oriented, support=0.33).has_bad_benchmark
+
+
+def test_texture_that_agrees_on_a_turned_camera_is_no_plain_cloth(frames):
+    """Of a camera that turned in its mount the edge alone would answer, as of cloth that shows light and shade."""
+    textured = orient_camera(frames[0], GEOMETRY.model_copy(update={"features": "texture"}), MOUNT, JOINT_M)
+    size = frames[0].shape[::-1]
+    turned = cv2.getRotationMatrix2D((0.5 * size[0], 0.5 * size[1]), 2.0, 1.0)
+    for frame in frames[1:]:
+        assert textured.fit(frame).features > 500
+        moved = np.asarray(cv2.warpAffine(frame, turned, size, flags=cv2.INTER_CUBIC), dtype=np.uint8)
+        assert textured.fit(moved).refused.code == "camera-turned"

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import postflight as pf
 from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
 from postflight import commands
+from postflight.streams import on_one_thread
 from tests.refusing import numbers_in
 
 UNITS = {"s", "m", "deg", "degps", "mps", "mps2", "pa", "k", "kgpm3", "px", "hz", "g", "nm", "j", "nms", "w", "kgm2"}
@@ -208,3 +210,17 @@ def test_force_coefficients_are_mass_times_acceleration_over_pressure_and_area(f
     pressure_area = known["dynamic_pressure_pa"].to_numpy() * vehicle.reference.area_m2
     np.testing.assert_allclose(known["c_a"], -force[:, 0] / pressure_area, rtol=1e-9)
     np.testing.assert_allclose(known["c_n"], np.hypot(*force[:, 1:].T) / pressure_area, rtol=1e-9)
+
+
+def test_linear_algebra_of_the_public_functions_runs_on_one_thread():
+    """However many a notebook's process has: two that wait for each other on a busy machine took 18 times as long."""
+
+    def threads():
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    for name in ("reconstruct", "fuse", "reconcile", "estimate_camera", "estimate_misalignment", "estimate_trim"):
+        assert getattr(pf, name).__wrapped__.__name__ == name
+    with threadpool_limits(limits=2, user_api="blas"):
+        assert threads() == {2}
+        assert on_one_thread(threads)() == {1}
+        assert threads() == {2}
