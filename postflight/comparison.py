@@ -18,7 +18,6 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory
 from flightmodel.tables import column_about
@@ -217,15 +216,13 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
     for q in TRAJECTORY:
         known = inside and bet[q.column].notna().any()
         out[q.column] = _near(bet, q.column, at_s) if known else nothing
-    loaded = bet["t_s"][pressure_pulse(np.nan_to_num(bet["dynamic_pressure_pa"].to_numpy(dtype=float)))]
     for method in METHODS:
         history = run.history(method)
         if history is None:
             continue
         theta, sd = np.rad2deg(history.at(at_s))
         out[f"deflection_{method}_deg"] = float(theta), float(sd)
-        largest = history.largest((loaded.iloc[0], loaded.iloc[-1]))
-        out[f"largest_{method}_deg"] = float(np.rad2deg(history.theta_rad[largest])), np.nan
+        out[f"largest_{method}_deg"] = run.summary["methods"][method].get("largest_deg", np.nan), np.nan
     return out
 
 
