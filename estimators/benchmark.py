@@ -155,7 +155,8 @@ def orient_camera(
     frame = unedited(benchmark)
     fault = fault_of_frame(frame.image, camera_mount.size_px)
     if fault:
-        raise GateError(f"benchmark frame: {fault}; choose another benchmark time", fault.code)
+        file = "check the film's file, or " if fault.code == "frame-undecodable" else ""
+        raise GateError(f"benchmark frame: {fault}; {file}choose another benchmark time", fault.code)
     camera = camera_from_mount(camera_mount)
     if pose is not None:
         camera = camera.turned(pose[:3], float(pose[3]))

@@ -214,9 +214,8 @@ def film_timing_fault(path: Path) -> Fault:
         film.release()
     remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
     if counts > 0 and not (len(times) >= counts - 1 if estimated else len(times) == counts):
-        return Fault(
-            f"{len(times)} frames can be decoded where the film's own count is {counts}: {remedy}", "film-count"
-        )
+        words = f"{len(times)} frames can be decoded where the film's own count is {counts}"
+        return Fault(f"{words}: is the file whole? If it is, {remedy}", "film-count")
     if len(times) < 3:
         return NO_FAULT
     step = np.diff(times)
