@@ -33,8 +33,8 @@ from flightmodel.checks import GateError
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.statistics import BAND_PERCENTILES, correlation
 from flightmodel.trajectory import resample
-from postflight.aero_increments import increments_of
 from postflight.flight import Flight
+from postflight.flown_coefficients import increments_of
 from postflight.fusing import fuse_flight
 from postflight.reconstruction import reconstruct
 from recon.settings import Settings

@@ -15,7 +15,7 @@ from postflight import run_folder
 from postflight.deflections import METHODS, estimate
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
-from postflight.score import BET_SD, score_run
+from postflight.scoring import BET_SD, score_run
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from flightmodel.trajectory import Trajectory
     from flightmodel.vehicle import read_vehicle
     from postflight import plots
-    from postflight.aero_increments import AeroIncrements
     from postflight.deflections import (
         Deflections,
         aero_increments,
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
         fuse,
     )
     from postflight.flight import Flight, read_flight
+    from postflight.flown_coefficients import AeroIncrements
     from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
     from postflight.reconciliation.command import reconcile
     from postflight.reconstruction import Reconstruction, air_data, reconstruct
@@ -66,7 +66,7 @@ _DOOR = {
     "estimate_trim": "postflight.deflections",
     "fuse": "postflight.deflections",
     "aero_increments": "postflight.deflections",
-    "AeroIncrements": "postflight.aero_increments",
+    "AeroIncrements": "postflight.flown_coefficients",
     "Deflections": "postflight.deflections",
     "DeflectionHistory": "flightmodel.deflection",
     "read_vehicle": "flightmodel.vehicle",

@@ -29,7 +29,7 @@ from postflight.flight import Flight, read_flight
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
-from postflight.score import PUBLISHED_DEG, Score, score_run
+from postflight.scoring import PUBLISHED_DEG, Score, score_run
 from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import return_large_arrays, write_out

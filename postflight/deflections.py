@@ -14,9 +14,9 @@ from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
-from postflight.aero_increments import AeroIncrements, increments_of
 from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
+from postflight.flown_coefficients import AeroIncrements, increments_of
 from postflight.fusing import FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread

@@ -1,7 +1,7 @@
 """What is known of a flight before it is reconstructed: its telemetry behind the gate, and what an analyst assumes.
 
 An assumption is part of the flight: `Flight.with_` gives another flight in which it differs, and everything that is
-computed from that flight rests on it. Nothing here opens ``truth/``; only `postflight.score` does.
+computed from that flight rests on it. Nothing here opens ``truth/``; only `postflight.scoring` does.
 """
 
 from __future__ import annotations

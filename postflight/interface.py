@@ -20,7 +20,7 @@ from postflight.montecarlo.bands import Merged, merge, write_merged
 from postflight.montecarlo.study import read_study
 from postflight.reconstruction import Reconstruction
 from postflight.report import write
-from postflight.score import Score, score_run
+from postflight.scoring import Score, score_run
 from synthetic_flight.ensemble import available_cores
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import Scenario, fly_scenario, read_scenario

@@ -32,10 +32,10 @@ if TYPE_CHECKING:  # the process decides first how pandas is loaded
     import pandas as pd
 
     from estimators.camera import FilmFit
-    from postflight.aero_increments import AeroIncrements
     from postflight.deflections import Deflections
     from postflight.filming import CameraAnswer
     from postflight.flight import Flight
+    from postflight.flown_coefficients import AeroIncrements
     from postflight.reconstruction import Reconstruction
     from postflight.studies.preflight import Bounds
 

@@ -91,7 +91,7 @@ DEGREES = (
     "flightmodel/config.py", "flightmodel/tables.py", "flightmodel/flightf", "flightmodel/vehicle.py",
     "flightmodel/instruments.py", "flightmodel/atmosphere.py", "synthetic_flight/scenarios.py",
     "synthetic_flight/instrument_errors.py", "synthetic_flight/sensing.py", "synthetic_flight/folder.py",
-    "postflight/cli.py", "postflight/commands.py", "postflight/run_folder.py", "postflight/score.py",
+    "postflight/cli.py", "postflight/commands.py", "postflight/run_folder.py", "postflight/scoring.py",
     "postflight/plots/", "postflight/studies/",
 )  # fmt: skip
 

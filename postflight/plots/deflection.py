@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from estimators.fusion import Fused
 from estimators.southwell import SPAN_S, Limbs
 from flightmodel.checks import FloatArray
-from postflight.aero_increments import AeroIncrements
 from postflight.deflections import Deflections
+from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import trajectory_angle, window
 from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, legend_above, stamp

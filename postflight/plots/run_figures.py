@@ -14,10 +14,10 @@ from estimators.loads import FlightLoads
 from estimators.trim import static_trim
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
-from postflight.aero_increments import AeroIncrements
 from postflight.deflections import Deflections
 from postflight.filming import by_camera
 from postflight.flight import Flight
+from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.deflection import figure_correlation, figure_fusion, figure_increments, figure_summary
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.paper_figures import figure_1_3, figure_2_3, figure_2_5, figure_2_7, figure_2_9

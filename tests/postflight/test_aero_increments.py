@@ -12,8 +12,8 @@ from estimators.increments import COEFFICIENTS, STATED
 from flightmodel.aerodynamics import read_with_sidecar, referred_to
 from flightmodel.checks import Fault, GateError
 from flightmodel.vehicle import DATA, vehicle_from_toml
-from postflight.aero_increments import TABLE, increments_of
 from postflight.deflections import Deflections, aero_increments, with_increments
+from postflight.flown_coefficients import TABLE, increments_of
 from postflight.fusing import fuse_flight
 from postflight.plots.deflection import figure_increments
 from postflight.run_folder import increments_summary

@@ -27,7 +27,7 @@ from postflight.reconciliation.modes import FACTORS, _peak, _track_power
 from postflight.reconstruction import _coefficients
 from postflight.report.panels import _FLOWN
 from postflight.runs import STATE_COLUMNS
-from postflight.score import _bet_errors, _method_row
+from postflight.scoring import _bet_errors, _method_row
 from postflight.studies import preflight
 from recon import atmosphere
 from synthetic_flight.linear import linear_matrix, modes, slopes_at

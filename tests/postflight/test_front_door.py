@@ -4,6 +4,7 @@ import inspect
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -224,3 +225,9 @@ def test_linear_algebra_of_the_public_functions_runs_on_one_thread():
         assert threads() == {2}
         assert on_one_thread(threads)() == {1}
         assert threads() == {2}
+
+
+@pytest.mark.parametrize("name", sorted(set(pf.__all__) - {"plots"}))
+def test_no_module_takes_the_place_of_a_public_name(name):
+    """A submodule becomes an attribute of its package as soon as anything imports it: `pf.score` was a module then."""
+    assert find_spec(f"postflight.{name}") is None

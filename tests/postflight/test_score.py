@@ -8,7 +8,7 @@ import pytest
 
 from flightmodel import earth
 from postflight.commands import console, print_score
-from postflight.score import score_run
+from postflight.scoring import score_run
 
 T = np.arange(0.0, 20.0, 0.1)
 
