@@ -403,7 +403,7 @@ def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
     doubled = sum(getattr(fit.refused, "code", "") == "picture-doubled" or fit.doubled > 0.0 for fit in fits)
     if doubled < max(_LEAST_MIXED, _MIXED * len(fits)):
         return fits
-    words = f"{doubled} frames of the film show the edge twice: it mixes pictures, and an edge here may lie between two"
+    words = f"{doubled} frames show, or may show, the edge twice: the film mixes pictures; an edge may lie between two"
     return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
 
 

@@ -19,8 +19,8 @@ by about 0.1 px, for `estimators.frame_solution.AprioriSd` to allow for.
 Assumed of the search from far: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this
 does not hold is refused, with the reason.
 
-A frame that shows the edge twice is two pictures mixed into one (`second_edge`). A second edge is the first
-one turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a deflection. Along a line across
+A frame that shows the edge twice is two pictures mixed into one (`second_edge`). A second edge is the first one
+turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a deflection. Along a line across
 every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is taken for which most points have a
 step there. The limb of the Earth, torus and shadow are steps too, but follow no turned edge far: in 435 sound frames of
 28 films, with and without the Earth, 0.4 of the points agree at the most. A ring painted or sewn round the shell does;
@@ -386,7 +386,7 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
 
 
 def second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray) -> tuple[float, Fault]:
-    """Share of edge points that agree on a second edge, zero if fewer than in any sound frame; why it is two pictures.
+    """Share of edge points that agree on a second edge, zero where it is usual; why it is two pictures, if it is.
 
     Parameters
     ----------

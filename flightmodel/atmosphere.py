@@ -524,8 +524,7 @@ def standard_sounding(planet: Planet = WGS84) -> Sounding:
 
     Density is uncertain by 10 % and each component of the wind by 15 m/s: the day's departure from the standard in
     middle latitudes and the usual winds of the stratosphere, not an instrument's error; temperature by
-    `standard_temperature_sd`. Of Mars, 0 to 250 km, by what
-    stands beside its temperatures above.
+    `standard_temperature_sd`. Of Mars, 0 to 250 km, by what stands beside its temperatures above.
     """
     if planet != WGS84:
         z = np.arange(BOTTOM_MARS_M, 250001.0, 1000.0)

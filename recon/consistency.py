@@ -326,8 +326,7 @@ def _most_drag(problem: Problem, at: States) -> FloatArray:
     """Deceleration (n,), m/s^2, of air that is denser than stated by twice its sd."""
     motion = problem.motion
     height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)[2]
-    row, grid = (height - motion.air_from_m) / motion.air_step_m, np.arange(len(motion.air))
-    log_density, density_sd = (np.interp(row, grid, motion.air[:, c]) for c in (0, 3))
+    log_density, _, _, density_sd, _ = motion.air_at(height)
     density = np.exp(log_density + 2.0 * density_sd)
     return np.asarray(0.5 * density * motion.drag_m2pkg * np.sum(at.velocity_ecef_mps**2, axis=1))
 

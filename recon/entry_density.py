@@ -92,9 +92,8 @@ def drag_of_drivers(
     motion, kept = problem.motion, np.flatnonzero(problem.kept)
     at = states[kept]
     latitude, longitude, height = earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)
-    row, grid = (height - motion.air_from_m) / motion.air_step_m, np.arange(len(motion.air))
-    _, wind_north, wind_east, density_sd, wind_sd = (np.interp(row, grid, c) for c in motion.air.T)
-    steeper = np.interp(row + 0.5, grid, motion.air[:, 0]) - np.interp(row - 0.5, grid, motion.air[:, 0])
+    _, wind_north, wind_east, density_sd, wind_sd = motion.air_at(height)
+    steeper = np.subtract(*(motion.air_at(height + side * motion.air_step_m)[0] for side in (0.5, -0.5)))
     ned = earth.dcm_ned_ecef(latitude, longitude)
     drivers = at.sensor_errors[:, :6]
     covariance = unpacked(triangles, KINEMATIC + 6)
@@ -116,8 +115,7 @@ def drag_of_drivers(
 
 def _log_drag(motion: Motion, at: States) -> FloatArray:
     """Logarithm (n,) of the drag over the velocity's square."""
-    row = (earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)[2] - motion.air_from_m) / motion.air_step_m
-    log_density, density_sd = (np.interp(row, np.arange(len(motion.air)), motion.air[:, c]) for c in (0, 3))
+    log_density, _, _, density_sd, _ = motion.air_at(earth.geodetic_from_ecef(at.position_ecef_m, motion.planet)[2])
     drivers = at.sensor_errors
     return np.asarray(np.log(motion.drag_m2pkg) + log_density + drivers[:, 0] + drivers[:, 3] * density_sd)
 
@@ -293,8 +291,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     Means over a second are compared with those two seconds before, or before a gap, since the filter rejects the first
     readings of another drag. What the air may change between the two heights beside the stated density follows from its
     uncertainty, of which the constant part has no share, and a climate's, wider than `_WAVES`, is of the whole profile;
-    what the readings scatter, from differences of neighbours.
-    Errors of speed and height are the same at both times.
+    what the readings scatter, from differences of neighbours. Errors of speed and height are the same at both times.
 
     Parameters
     ----------

@@ -119,6 +119,11 @@ class Motion(NamedTuple):
         """Number of errors that the motion depends on."""
         return _BALLISTIC_DRIVERS if self.ballistic else _STRAPDOWN_DRIVERS + _CLOCKS * self.clocks
 
+    def air_at(self, height_m: FloatArray) -> FloatArray:
+        """Columns of ``air``, (5, n), at heights (n,)."""
+        row, grid = (height_m - self.air_from_m) / self.air_step_m, np.arange(len(self.air))
+        return np.array([np.interp(row, grid, column) for column in self.air.T])
+
 
 def strapdown_motion(
     time_s: FloatArray,

@@ -75,9 +75,9 @@ def test_readings_in_whole_counts_show_the_count(step):
     given = record(100.0)
     counts = np.round(40.0 * given.measured_sensor / step)
     printed = [[float(f"{x:.7g}") for x in row] for row in counts * step / 9.80665]
-    found, told = with_least_count(replace(given, measured_sensor=9.80665 * np.array(printed)))
+    found, findings = with_least_count(replace(given, measured_sensor=9.80665 * np.array(printed)))
     assert found.spec.resolution == pytest.approx(step, rel=1e-3)
-    assert [finding.code for finding in told] == ["least-count"]
+    assert [finding.code for finding in findings] == ["least-count"]
     assert replace(found.spec, resolution=given.spec.resolution) == given.spec
 
 
