@@ -50,10 +50,9 @@ from flightmodel.config import (
     Place,
     Section,
     check_one_of,
-    parse_section,
-    read_toml,
+    read_section,
 )
-from flightmodel.files import file_bytes
+from flightmodel.files import file_bytes, nothing_at
 from flightmodel.sphere_cone import (
     bridge,
     sphere_cone_closed_form,
@@ -218,7 +217,7 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     try:
         text = file_bytes(path, LARGEST_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such aerodynamic table", code="file-missing") from None
+        raise ConfigError(f"{path}: {nothing_at(path)}", code="file-missing") from None
     except (OSError, UnicodeDecodeError) as fault:
         code = getattr(fault, "code", "file-unreadable")
         raise GateError(f"{path}: cannot be read as a table: {getattr(fault, 'strerror', fault)}", code) from None
@@ -657,7 +656,7 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
     faults: list[str] = []
     beside, sidecar, table = path.with_suffix(".toml"), None, None
     try:
-        sidecar = parse_section(Sidecar, read_toml(beside), str(beside))
+        sidecar = read_section(Sidecar, beside)
     except ConfigError as fault:
         wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
         faults += fault.faults if beside.exists() else [Fault(f"{beside}: no such file{wanted}", "sidecar-missing")]
@@ -666,9 +665,7 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
     try:
         daveml = path.suffix.lower() in (".dml", ".xml")
         if not path.is_file():
-            raise ConfigError(
-                f"{path}: no such aerodynamic table; key 'aerodynamics.table' names it", code="file-missing"
-            )
+            raise ConfigError(f"{path}: {nothing_at(path)}; key 'aerodynamics.table' names it", code="file-missing")
         table = read_daveml(path, ("CD", "CL") if wind else ("CA", "CN")) if daveml else read_aero_table(path, names)
         if daveml:
             check_axial_flow(path, table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 import unicodedata
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
-from flightmodel.files import file_bytes
+from flightmodel.files import file_bytes, nothing_at
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -132,7 +133,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(file_bytes(path, LARGEST_TOML_BYTES).decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file", code="file-missing") from None
+        raise ConfigError(f"{path}: {nothing_at(path)}", code="file-missing") from None
     except RecursionError:
         raise ConfigError(
             f"{path}: not valid TOML: arrays or tables lie too deep in each other", code="toml-syntax"
@@ -143,6 +144,30 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{path}: cannot be read: {fault.strerror or fault}", getattr(fault, "code", "file-unreadable")
         ) from None
+
+
+def read_section(model: type[SectionT], path: Path) -> SectionT:
+    """Read a TOML file as ``model``; `ConfigError` with its faults, and the files it names that are not there."""
+    tables = read_toml(path)
+    try:
+        return parse_section(model, tables, str(path))
+    except ConfigError as fault:
+        named = [(key, path.parent / name) for key, name in _named_files(tables)]
+        absent = [
+            Fault(f"{path}: key '{key}': {file}: {nothing_at(file)}", "file-missing")
+            for key, file in named
+            if not os.path.exists(file)  # False also for a name too long for a file
+        ]
+        raise ConfigError([*fault.faults, *absent]) from None
+
+
+def _named_files(tables: dict[str, Any], above: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    """Key and value of each file that tables name, those inside them too."""
+    for key, value in tables.items():
+        if isinstance(value, dict):
+            yield from _named_files(value, (*above, key))
+        elif isinstance(value, str) and (key == "file" or value.endswith(".toml")) and "\0" not in value:
+            yield ".".join((*above, key)), value
 
 
 def parse_section(model: type[SectionT], tables: dict[str, Any], where: str) -> SectionT:

@@ -39,6 +39,7 @@ _KINDS = {
 # not handed to child processes, bytes as they are, and no waiting for a pipe; each system has some of them
 _FLAGS = sum({getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOINHERIT", "O_BINARY", "O_NONBLOCK")})
 PARTIAL = "partial"
+MOST_LISTED = 8  # names of files in a message: about two lines
 LEFT_ALONE_S = 86400.0  # far beyond the longest pause in writing and any difference of clocks
 _HEX = "[0-9a-f]{8}"
 _NAME = re.compile(rf"\.(?P<kind>[a-z]+)-(?P<machine>{_HEX})-(?P<process>\d+)-{_HEX}-(?P<name>.+)", re.DOTALL)
@@ -89,6 +90,17 @@ def unfit(path: Path, most_bytes: int) -> Fault:
     except OSError:
         return Fault("no such file", "file-missing")
     return NO_FAULT
+
+
+def nothing_at(path: Path) -> Fault:
+    """Say that there is no such file, and what there is in its place."""
+    folder = path.parent
+    try:
+        there = sorted(p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
+    except OSError:
+        return Fault(f"no such file: there is no folder {folder}", "file-missing")
+    listed = ", ".join(there[:MOST_LISTED]) + (", ..." if len(there) > MOST_LISTED else "")
+    return Fault(f"no such file; there are: {listed or 'none'}", "file-missing")
 
 
 def leads_outside(folder: Path, named: str) -> bool:

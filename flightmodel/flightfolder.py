@@ -31,9 +31,8 @@ from flightmodel.config import (
     Name,
     Section,
     Time,
-    parse_section,
     parse_utc,
-    read_toml,
+    read_section,
 )
 from flightmodel.csv_reading import file_sha256
 from flightmodel.earth import (
@@ -398,8 +397,9 @@ def read_flight_file(folder: Path) -> FlightFile:
     """Read and check ``flight.toml`` of a flight folder; `ConfigError` with every fault."""
     path = folder / "flight.toml"
     if not folder.is_dir():
-        raise ConfigError(f"{folder}: no such flight folder", code="folder-missing")
-    return parse_section(FlightFile, read_toml(path), str(path))
+        words = f"is a file; its folder is wanted: {folder.parent}" if folder.is_file() else "no such flight folder"
+        raise ConfigError(f"{folder}: {words}", code="folder-missing")
+    return read_section(FlightFile, path)
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from flightmodel import rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
-from flightmodel.files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes, nothing_at
 from flightmodel.mesh_sections import section_supports, touching_circles
 
 if TYPE_CHECKING:
@@ -465,7 +465,7 @@ def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
         Where it is too large, cut off, of another kind, empty, or not closed.
     """
     if not path.is_file():
-        raise ConfigError(f"{path}: no such mesh; key 'meshes' names it", code="file-missing")
+        raise ConfigError(f"{path}: {nothing_at(path)}; key 'meshes' names it", code="file-missing")
     try:
         data, kind = file_bytes(path, LARGEST_BYTES), path.suffix.lower()[1:]
     except UnfitFile as unfit:

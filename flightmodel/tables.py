@@ -41,7 +41,7 @@ from scipy import constants
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.config import KeyFaults, Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
-from flightmodel.files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes, nothing_at
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -355,7 +355,7 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
         content = file_bytes(path)
         text = "\0" if b"\0" in content else content.decode("utf-8-sig")
     except FileNotFoundError:
-        raise GateError(f"{label}: {path}: no such file", code="file-missing") from None
+        raise GateError(f"{label}: {path}: {nothing_at(path)}", code="file-missing") from None
     except UnfitFile as fault:
         raise GateError(f"{label}: {path}: {fault.strerror}", fault.code) from None
     except (UnicodeDecodeError, OSError) as fault:
@@ -365,7 +365,9 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if len(numbered) <= least_rows:
         rows = max(0, len(numbered) - 1)
-        raise GateError(f"{label}: {path}: {rows} data rows; at least {least_rows} needed", code="too-few-rows")
+        found = f"{rows} data rows" if numbered else "is empty"
+        words = f"{found}; a header and at least {least_rows} rows are needed: deliver it whole, or take its table out"
+        raise GateError(f"{label}: {path}: {words}", code="too-few-rows")
     lines = np.array([k for k, _ in numbered[1:]])
     opened = _open_quote(numbered)
     if opened:

@@ -29,8 +29,7 @@ from flightmodel.config import (
     Section,
     Time,
     check_one_of,
-    parse_section,
-    read_toml,
+    read_section,
 )
 from flightmodel.deflection import lv_direction
 from flightmodel.files import leads_outside
@@ -520,7 +519,7 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     ConfigError
         With every fault of the file, unknown keys with the nearest known one.
     """
-    spec = parse_section(VehicleFile, read_toml(path), str(path))
+    spec = read_section(VehicleFile, path)
     shell, reference = spec.geometry, spec.reference
     shape = Shape(
         float(np.deg2rad(shell.half_angle_deg)),

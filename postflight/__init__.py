@@ -22,7 +22,8 @@ Conventions
 - ``error = estimate - truth``, ``residual = measured - predicted``; +/- is one standard deviation (``_sd``).
 - Times are seconds after the flight's t0; heights are above the WGS-84 ellipsoid; wind is the velocity of the air mass.
 
-CONVENTIONS.md has them all. Refusals are `ValueError` with a stable code for each fault (``error.codes``).
+CONVENTIONS.md has them all. Refusals are `GateError`, a `ValueError`, with a stable code for each fault
+(``error.codes``).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from flightmodel.checks import GateError
     from flightmodel.deflection import DeflectionHistory
     from flightmodel.trajectory import Trajectory
     from flightmodel.vehicle import read_vehicle
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
 
 # imported on first use, so that `postflight --help` answers at once
 _DOOR = {
+    "GateError": "flightmodel.checks",
     "read_flight": "postflight.flight",
     "Flight": "postflight.flight",
     "check_flight": "postflight.interface",
@@ -84,6 +87,7 @@ __all__ = [
     "DeflectionHistory",
     "Deflections",
     "Flight",
+    "GateError",
     "Reconstruction",
     "Settings",
     "Trajectory",

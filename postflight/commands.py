@@ -36,7 +36,6 @@ from postflight.streams import return_large_arrays, write_out
 from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.terminal import progress_bar, terminal
 from recon.consistency import ConsistencyCheck
-from recon.setup import check_sources
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -295,9 +294,7 @@ class Asked:
         if self.rate_hz is not None:  # how densely it is written is no assumption
             flight = replace(flight, settings=replace(flight.settings, output_rate_hz=self.rate_hz))
         flight = flight.with_(**self.changes)
-        flight = flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
-        check_sources(flight.telemetry, flight.settings)
-        return flight
+        return flight.with_(without=(*flight.settings.without, *self.without)) if self.without else flight
 
 
 def asked(

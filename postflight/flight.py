@@ -102,8 +102,10 @@ class Flight(Tabular):
         Raises
         ------
         ConfigError
-            Names that are no assumption, values that cannot be; all at once.
+            Names that are no assumption, values that cannot be, sources that the flight does not have; all at once.
         """
+        from recon.setup import check_sources  # it brings the filter's kernels, which a flight is read without
+
         flight = self
         faults: list[str] = []
         for name, value in changes.items():
@@ -111,6 +113,10 @@ class Flight(Tabular):
                 flight = replace(_changed(flight, name, value), changes=(*flight.changes, f"{name} = {value}"))
             except GateError as fault:
                 faults += fault.faults
+        try:
+            check_sources(flight.telemetry, flight.settings)
+        except ConfigError as fault:
+            faults += fault.faults
         if faults:
             raise ConfigError(faults)
         return flight

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.files import UnfitFile, file_bytes
+from flightmodel.files import UnfitFile, file_bytes, nothing_at
 from flightmodel.tables import plain_number
 from postflight.intake.headers import SEVERAL_MEANINGS, UNIT_SPELLINGS, unit_key
 
@@ -94,7 +94,7 @@ def read_text_table(path: Path) -> FreeFormTable:
     try:
         raw = file_bytes(path)
     except FileNotFoundError:
-        raise GateError(f"{path}: no such file", code="file-missing") from None
+        raise GateError(f"{path}: {nothing_at(path)}", code="file-missing") from None
     except UnfitFile as fault:
         raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     text, notes = _decoded(path, raw)

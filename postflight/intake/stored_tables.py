@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.files import TABLE_BYTES, UnfitFile, open_file
+from flightmodel.files import TABLE_BYTES, UnfitFile, nothing_at, open_file
 from postflight.intake.freeform_tables import LEAST_ROWS, FreeFormTable, read_text_table, table_of_lines
 
 _MOST_NUMBERS = 200_000_000  # of a file
@@ -101,7 +101,7 @@ def read_tables(path: Path) -> list[FreeFormTable]:
         with open_file(path) as file:
             head = file.read(_HEAD)
     except FileNotFoundError:
-        raise GateError(f"{path}: no such file", code="file-missing") from None
+        raise GateError(f"{path}: {nothing_at(path)}", code="file-missing") from None
     except UnfitFile as fault:
         raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     if path.suffix.lower() == ".mat":

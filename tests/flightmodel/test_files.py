@@ -8,7 +8,10 @@ import time
 
 import pytest
 
-from flightmodel.files import LEFT_ALONE_S, abandoned, machine, partial_path
+from flightmodel.checks import ConfigError
+from flightmodel.files import LEFT_ALONE_S, abandoned, machine, nothing_at, partial_path
+from flightmodel.flightfolder import read_flight_file
+from tests.refusing import refuses
 
 DEAD = 2**22  # above the largest number that Linux gives a process
 WAIT_S = 60.0
@@ -132,3 +135,27 @@ def test_the_same_run_twice_in_one_second(tmp_path):
     both = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(4)]
     assert [process.communicate(timeout=WAIT_S)[1] for process in both] == [""] * 4
     assert not list((tmp_path / "runs").glob(".*"))
+
+
+def test_a_file_that_is_not_there_is_refused_with_those_that_are(tmp_path):
+    for name in ("radar_b.csv", "rates.csv", ".radar_a.csv"):
+        (tmp_path / name).touch()
+    assert nothing_at(tmp_path / "radar_a.csv").endswith("there are: radar_b.csv, rates.csv")
+    elsewhere = tmp_path / "tables" / "radar_a.csv"
+    assert nothing_at(elsewhere).endswith(f"no folder {elsewhere.parent}")
+    for number in range(20):
+        (tmp_path / f"a{number:02d}.csv").touch()
+    assert nothing_at(tmp_path / "radar_a.csv").endswith("a07.csv, ...")
+
+
+def test_absent_files_are_named_with_the_faults_of_the_keys(tmp_path):
+    (tmp_path / "flight.toml").write_text(
+        'name = "x"\nt0_utc = "2009-08-17T12:52:00Z"\nvehicle = "mine.toml"\nspeed = 3\n'
+        f'[radars.a]\nfile = "a.csv"\n[radars.b]\nfile = "{"b" * 300}.csv"\n'
+    )
+    with refuses("key-unknown", "file-missing", "key-missing", kind=ConfigError) as caught:
+        read_flight_file(tmp_path)
+    absent = [str(f) for f in caught.value.faults if f.code == "file-missing"]
+    assert [f.split("'")[1] for f in absent] == ["vehicle", "radars.a.file", "radars.b.file"]
+    with refuses("folder-missing", names=(f"folder is wanted: {tmp_path}",), kind=ConfigError):
+        read_flight_file(tmp_path / "flight.toml")

@@ -125,6 +125,15 @@ def test_every_fault_of_a_what_if_is_named_at_once(flight):
     assert "c_n" in refusal.value.faults[0]
 
 
+def test_a_source_to_leave_out_is_one_of_the_flights(flight):
+    there = next(iter(flight.telemetry.radars))
+    with pytest.raises(pf.GateError) as refusal:
+        flight.with_(without=("radar9", there), cn=1.1)
+    assert refusal.value.codes == ("what-if-unknown", "source-unknown")
+    assert "'radar9'" in refusal.value.faults[1]
+    assert there in refusal.value.faults[1]
+
+
 def test_an_assumption_reaches_every_estimator_that_uses_it(flight, bet, answer):
     """C_N is used by misalignment, trim and fusion, and by no part of the trajectory."""
     other = pf.reconstruct(flight.with_(c_n=1.2))
