@@ -229,8 +229,8 @@ def film_timing_fault(path: Path) -> Fault:
     return NO_FAULT
 
 
-def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
-    """Say why a film of a camera with pictures of a size cannot be used; empty when it can."""
+def start_fault(path: Path) -> Fault:
+    """Say why a file is no film by its first bytes; empty where they are a film's."""
     if fault := unfit(path, sys.maxsize):  # it is decoded frame by frame
         return fault
     if path.stat().st_size == 0:
@@ -240,6 +240,13 @@ def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
     # by content: a list of other places to play from would be opened too
     if not (start[:4] == WEBM_START or start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")):
         return Fault(UNKNOWN_FILM, "film-unreadable")
+    return NO_FAULT
+
+
+def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
+    """Say why a film of a camera with pictures of a size cannot be used; empty when it can."""
+    if fault := start_fault(path):
+        return fault
     film = cv2.VideoCapture(str(path))
     try:
         if not film.isOpened():

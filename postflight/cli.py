@@ -563,12 +563,24 @@ def _postponed(number: int, frame: FrameType | None) -> bool:
     """
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib") or _BINDINGS in frame.f_code.co_filename:
-            again = threading.Timer(_AGAIN_S, _send_again, (number,))
-            again.daemon = True
-            again.start()
+            _try_again(number)
             return True
         frame = frame.f_back
     return False
+
+
+def unraisable(lost: Any) -> None:
+    """Send a signal again whose exception Python had to drop, as in ``__del__``; show what else it drops."""
+    if issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
+        _try_again(signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM)
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _try_again(number: int) -> None:
+    again = threading.Timer(_AGAIN_S, _send_again, (number,))
+    again.daemon = True
+    again.start()
 
 
 def _send_again(number: int) -> None:
@@ -584,6 +596,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, terminate)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # else the parent has it ignored
         signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = unraisable
     open_streams()
     pin_threads()
     try:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import signal
+import threading
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -162,6 +163,9 @@ class SecondProcess:
 
 def _made(there: Connection, here: Connection, draws: bool) -> Any:
     """The process, not started yet: a fork where this thread is the only one."""
+    for thread in threading.enumerate():
+        if isinstance(thread, threading.Timer):  # an interrupt that waits for the end of an import: it comes first
+            thread.join()
     forks = _THREADS.is_dir() and len(list(_THREADS.iterdir())) == 1
     context: Any = multiprocessing.get_context("fork" if forks else "spawn")  # there is no type for both
     return context.Process(target=_serve, args=(there, here if forks else None, draws), daemon=True)

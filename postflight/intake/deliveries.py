@@ -36,6 +36,7 @@ from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
 from flightmodel.config import read_toml
 from flightmodel.files import file_bytes, write_file, writing
+from flightmodel.film import start_fault
 from flightmodel.instruments import TriadSpec
 from flightmodel.tables import to_si
 from flightmodel.telemetry import TriadRecord, find_rest, mean_readings
@@ -485,6 +486,8 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     for file in files:
         video = _video_of(file, folder / "telemetry")
         if video is not None:
+            if video.is_film and (fault := start_fault(file)):
+                faults.append(Fault(f"{file}: {fault}", fault.code))
             came.videos.append(video)
             came.skipped += _beside_pictures(file, video)
         elif file.is_dir():

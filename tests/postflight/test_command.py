@@ -372,6 +372,34 @@ def test_signals_amid_an_import_or_bindings_wait_for_its_end(amid, sent, handler
         signal.signal(sent, before)
 
 
+INTERRUPTED_AS_FREED = """
+import os, signal, time
+from postflight import cli
+
+class Freed:
+    def __del__(self):
+        os.kill(os.getpid(), signal.{sent})
+        time.sleep(1.0)
+
+def work(**_):
+    Freed()
+    time.sleep(30.0)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+cli.cli.main = work
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("sent", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_whose_exception_python_drops_is_not_lost(sent, code) -> None:
+    """What is raised while an object is freed goes no further; the command would carry on."""
+    script = INTERRUPTED_AS_FREED.replace("{sent}", sent)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+
+
 # ---------------------------------------------------------------------------------------------------------------- score
 
 

@@ -237,3 +237,12 @@ def test_import_and_check_count_the_same_values(folder, tmp_path):
     keys = [w.split("'")[1] for w in checked["fill_in"]]
     assert {"name", "radars.second.height_m", "motion.drag_area_per_mass_m2pkg", "joint.station_m"} <= set(keys)
     assert all(key in out for key in keys)
+
+
+def test_a_film_that_is_none_is_refused_before_it_is_copied(folder, tmp_path):
+    (tmp_path / "film.mp4").write_text("a line of text\n" * 9)
+    (tmp_path / "none.webm").touch()
+    with pytest.raises(GateError) as refusal:
+        run("import", tmp_path / "film.mp4", tmp_path / "none.webm", "--into", folder)
+    assert refusal.value.codes == ("film-unreadable", "file-empty")
+    assert not list((folder / "telemetry").glob("*"))
