@@ -352,15 +352,15 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         console.print(escape(flight.attitude.remark))
     for rests in flight.rests_on:
         console.print(escape(rests))
-    print_checks(flight.consistency_checks)
+    print_checks(flight.consistency_checks, "trajectory")
     for k, suspect in enumerate(flight.suspects):
         line(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
 
 
-def print_checks(checks: tuple[ConsistencyCheck, ...]) -> None:
-    """Print how many checks pass, and in red those that fail."""
+def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
+    """Print how many checks of something pass, and in red those that fail."""
     failed = [check for check in checks if not check.passed]
-    console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks pass")
+    console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")
     for check in failed:
         numbers = f"{check.value:.3g} outside {check.low:.3g} to {check.high:.3g}"
         line("[red]check failed[/]", f"{check.name}: {check.remark} ({numbers})", check.code)
@@ -378,9 +378,7 @@ def print_increments(answers: Deflections) -> None:
     if answers.increments is None:
         return
     console.print(f"against the preflight table, {escape(answers.increments.about)}")
-    for check in answers.increments.consistency_checks:
-        if not check.passed:
-            line("[red]check failed[/]", f"{check.name}: {check.remark}", check.code)
+    print_checks(answers.increments.consistency_checks, "coefficients")
 
 
 def print_sensitivity(found: pd.DataFrame) -> None:
@@ -434,6 +432,8 @@ def print_answers(answers: Deflections) -> None:
             console.print(escape(check.remark))
         else:
             line("[red]check failed[/]", check.remark, check.code)
+    passed = sum(check.passed for check in answers.consistency_checks)
+    console.print(f"{passed} of {len(answers.consistency_checks)} consistency checks of the deflection pass")
     bias = None if answers.fused is None else answers.fused.camera_time_bias
     if bias is not None and bias.applied:
         console.print(escape(bias.remark))

@@ -15,7 +15,7 @@ from flightmodel.checks import FloatArray
 from postflight.deflections import Deflections
 from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.overlay import benchmark_and_largest
-from postflight.plots.paper_figures import trajectory_angle, window
+from postflight.plots.paper_figures import fit_height, trajectory_angle, window
 from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, legend_above, stamp
 from postflight.reconstruction import Reconstruction
 
@@ -57,7 +57,8 @@ def figure_summary(
     upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(flight), ylim=(0, top_deg))
     legend_above(upper, 5, "bands: 1 sd; dotted: peak dynamic pressure")
     trajectory_angle(lower, flight, "centerbody total angle of attack, 1 sd")
-    lower.set(ylabel="angle of attack (deg)", xlabel=TIME, ylim=(0, 16))
+    lower.set(ylabel="angle of attack (deg)", xlabel=TIME)
+    fit_height(lower, flight)
     legend_above(lower, 1)
     pressure = lower.twinx()
     pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
@@ -114,7 +115,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     left = [np.sqrt(fused.inputs[n][1][0, 0]) for n in names]
     inputs.errorbar(mean, range(len(names)), xerr=left, fmt="o", color=COLOUR["fused"], capsize=3)
     inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
-    inputs.set_yticks(range(len(names)), names, fontsize=8)
+    inputs.set_yticks(range(len(names)), names, fontsize=min(8.0, 160.0 / len(names)))
     inputs.set(xlabel="estimate and 1 sd, in a priori standard deviations (grey: a priori)")
     figure.suptitle(fill(words, 130), fontsize=10)
     return figure

@@ -76,6 +76,9 @@ def write_overlay(
     assert frames is not None
     overlay = Overlay(oriented.view, telemetry.required_vehicle().meshes)
     picture = overlay.side_by_side(frames.picture(frame), theta_rad, plane_rad)
+    mark = "SYNTHETIC flight, " if telemetry.synthetic else ""
+    angles = f"{np.rad2deg(theta_rad):.2f} deg towards {np.rad2deg(plane_rad):.0f} deg LV"
+    write_lines(picture, [f"{telemetry.name}: {mark}{frames.time_s[frame]:.2f} s; virtual camera at {angles}"])
     path.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 

@@ -50,6 +50,19 @@ def trajectory_angle(ax: Axes, flight: Reconstruction, label: str) -> None:
     band(ax, air.time_s, alpha, sd, COLOUR["estimate"])
 
 
+def fit_height(
+    ax: Axes, flight: Reconstruction, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
+) -> None:
+    """Let an axis of angles, deg, end above those lines, by their label's start, that the window shows."""
+    first, last = window(flight)
+    lines = [
+        np.asarray(line.get_xydata(), dtype=np.float64) for line in ax.lines if str(line.get_label()).startswith(of)
+    ]
+    shown = [xy[(xy[:, 0] >= first) & (xy[:, 0] <= last), 1] for xy in lines]
+    top = room * max((float(np.nanmax(y)) for y in shown if np.isfinite(y).any()), default=most)
+    ax.set_ylim(0.0, min(top, most))
+
+
 @in_style
 def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: int = 100) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3).
@@ -73,7 +86,8 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     upper.plot(air.time_s, ground, color=COLOUR["ground"], lw=1, ls="--", label="trajectory, no wind")
     normal = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
     lower.plot(pulse.time_s, normal, color=COLOUR["estimate"], lw=1.4, label="measured, at the c.g.")
-    upper.set(ylabel="total angle of attack (deg)", ylim=(0, 16), xlim=window(flight))
+    upper.set(ylabel="total angle of attack (deg)", xlim=window(flight))
+    fit_height(upper, flight, of=("trajectory",), room=1.5)  # a rigid vehicle may tumble: its band ends with the axis
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel=TIME)
     legend_above(upper, 3)
     legend_above(lower, 4)
@@ -172,11 +186,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
 
 def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
     ax.set(xlim=window(flight), ylabel="total angle of attack (deg)", xlabel=TIME)
-    first, last = window(flight)
-    lines = [np.asarray(line.get_xydata(), dtype=np.float64) for line in ax.lines]
-    shown = [xy[(xy[:, 0] >= first) & (xy[:, 0] <= last), 1] for xy in lines]
-    most = max((float(np.nanmax(y)) for y in shown if np.isfinite(y).any()), default=_LOOK_UP_END_DEG)
-    ax.set_ylim(0.0, min(1.15 * most, _LOOK_UP_END_DEG))
+    fit_height(ax, flight, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)
     figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
     stamp(figure, flight.telemetry, flight.flight.changes)

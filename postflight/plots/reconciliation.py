@@ -57,7 +57,8 @@ def _residuals(ax: Axes, t: FloatArray, residual: FloatArray, label: str) -> Non
     for axis, (name, colour) in enumerate(AXES.items()):
         ax.plot(t, residual[..., axis].ravel(), color=colour, lw=0, marker=".", ms=1.5, label=name)
     limits(ax)
-    ax.set_ylim(-5.0, 5.0)
+    far = max(5.0, 1.05 * float(np.nanmax(np.abs(residual), initial=0.0)))
+    ax.set_ylim(-far, far)
     ax.set_ylabel(label)
     ax.legend(ncols=3, markerscale=4)
 

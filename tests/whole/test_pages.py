@@ -310,7 +310,7 @@ def start(line: str, folder: Path) -> subprocess.Popen:
 def as_shown(printed: str) -> None:
     """What README and tutorial show of the demo is what it prints, to a unit of the last digit."""
     readme, tutorial = (ROOT / "README.md").read_text(), (ROOT / "docs" / "tutorial-demo.md").read_text()
-    passed = re.search(r"\d+ of \d+ consistency checks pass", printed)
+    passed = re.search(r"\d+ of \d+ consistency checks of the trajectory pass", printed)
     assert passed
     assert f"`{passed[0]}`" in tutorial
     for method in ("camera", "misalignment", "trim", "fused"):
