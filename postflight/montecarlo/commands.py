@@ -58,8 +58,12 @@ def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     if wanted.scheduler is not None and execution.is_open(wanted.scheduler):
         words = f"--scheduler {wanted.scheduler}: not encrypted, and whoever reaches its port can run code there; use tls://"
         line("[yellow]found[/]", words, "scheduler-open")
-    with progress_bar() as report:
-        return execution.run(study, folder, wanted, report)
+    try:
+        with progress_bar() as report:
+            return execution.run(study, folder, wanted, report)
+    except KeyboardInterrupt:
+        console.print(f"{escape(str(folder))} keeps every finished chunk; the same command resumes from there")
+        raise
 
 
 def finish(study: Study, folder: Path, flights: int) -> Merged:

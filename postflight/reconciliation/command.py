@@ -203,7 +203,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_csv("bands_shares.csv", shares)
             draw(figures / "bands.png", bands_picture)
     _print_joint(fit, table, odds)
-    print_checks(checks)
+    print_checks(checks, "fit")
     if posterior is not None:
         _print_posterior(posterior)
     if modal is None:

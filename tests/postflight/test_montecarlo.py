@@ -68,7 +68,7 @@ def test_bands_in_slabs_are_the_same(reference, study_path, tmp_path, monkeypatc
 
 def command(path, folder, *more):
     arguments = ("montecarlo", "run", path, folder, *more)
-    return start_command(*arguments, stdout=subprocess.DEVNULL, start_new_session=True)
+    return start_command(*arguments, stdout=subprocess.PIPE, start_new_session=True)
 
 
 def chunks_in(folder):
@@ -123,10 +123,11 @@ def test_control_c_leaves_a_folder_that_goes_on(study_path, tmp_path):
     process = command(study_path, folder, "--flights", str(flights), "--workers", "2")
     wait_for_chunks(process, folder, 3)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
-    printed = process.communicate(timeout=30)[1].decode()
+    told, printed = (text.decode() for text in process.communicate(timeout=30))
     assert process.returncode == 130
     assert "Traceback" not in printed
     assert "interrupted" in printed
+    assert "resumes" in told
     wait_until_alone(process.pid)
     assert not list(folder.rglob(PARTIAL_GLOB))
     found = status(folder)
