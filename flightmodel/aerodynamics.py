@@ -222,7 +222,21 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         code = getattr(fault, "code", "file-unreadable")
         raise GateError(f"{path}: cannot be read as a table: {getattr(fault, 'strerror', fault)}", code) from None
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
-    header = [cell.strip() for cell in lines[0][1].split("#")[0].split(",")] if lines else []
+    columns = _columns(path, names, lines[0] if lines else (1, ""))
+    rows, faults = [], []
+    for k, line in lines[1:]:
+        row, wrong = _grid_point(line, names, columns)
+        rows.append(row)
+        faults += [Fault(f"{path}, line {k}: {fault}", fault.code) for fault in wrong]
+    if faults:
+        more = Fault(f"{path}: {len(faults)} faults in all", "more-faults")
+        raise GateError([*faults[:MOST_FAULTS], *[more] * (len(faults) > MOST_FAULTS)])
+    return _on_grid(path, np.array(rows, dtype=float).reshape(-1, len(names)))
+
+
+def _columns(path: Path, names: tuple[str, ...], head: tuple[int, str]) -> list[str]:
+    """Columns of a table from its first line, number and text; `GateError` where wanted ones are not there once."""
+    header = [cell.strip() for cell in head[1].split("#")[0].split(",")] if head[1] else []
     header = [c.lower() if c.lower() in names else c for c in header]
     missing = [c for c in names if c not in header]
     if missing:
@@ -232,53 +246,38 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
         raise GateError("; ".join([f"{path}: {words}", *meant]), code="aero-column-missing")
     twice = [c for c in names if header.count(c) > 1]
     if twice:
-        raise GateError(
-            f"{path}, line {lines[0][0]}: columns {', '.join(twice)} stand twice; keep one of each", code="column-twice"
-        )
-    rows, faults = [], []
-    for k, line in lines[1:]:
-        cells = [cell.strip() for cell in line.split("#")[0].split(",")]
-        if len(cells) != len(header):
-            faults.append(
-                Fault(
-                    f"{path}, line {k}: {len(cells)} cells where {len(header)} are wanted; got '{line.strip()}'",
-                    "row-ragged",
-                )
-            )
-            continue
-        row = [plain_number(cells[header.index(c)]) for c in names]
-        rows.append(row)
-        bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
-        at = f"{path}, line {k}"
-        faults += [
-            Fault(f"{at}: column '{c}': '{cells[header.index(c)]}' is no finite number", "not-a-number") for c in bad
-        ]
-        faults += [] if bad else [Fault(f"{at}: {fault}", fault.code) for fault in _row_faults(row, names)]
-    if faults:
-        more = Fault(f"{path}: {len(faults)} faults in all", "more-faults")
-        raise GateError([*faults[:MOST_FAULTS], *[more] * (len(faults) > MOST_FAULTS)])
-    values = np.array(rows, dtype=float).reshape(-1, len(names))
+        words = f"columns {', '.join(twice)} stand twice; keep one of each"
+        raise GateError(f"{path}, line {head[0]}: {words}", code="column-twice")
+    return header
+
+
+def _grid_point(line: str, names: tuple[str, ...], columns: list[str]) -> tuple[list[float], list[Fault]]:
+    """Numbers of a line in the order of ``names``, and what is wrong with them."""
+    cells = [cell.strip() for cell in line.split("#")[0].split(",")]
+    if len(cells) != len(columns):
+        words = f"{len(cells)} cells where {len(columns)} are wanted; got '{line.strip()}'"
+        return [], [Fault(words, "row-ragged")]
+    there = {c: cells[columns.index(c)] for c in names}
+    row = [plain_number(cell) for cell in there.values()]
+    bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
+    faults = [Fault(f"column '{c}': '{there[c]}' is no finite number", "not-a-number") for c in bad]
+    return row, faults or _row_faults(row, names)
+
+
+def _on_grid(path: Path, values: FloatArray) -> AeroTable:
+    """Table of points (n, 6) that lie on a whole grid; `GateError` where they do not."""
     values = values[np.lexsort((values[:, 1], values[:, 0]))]
     mach, alpha_deg = np.unique(values[:, 0]), np.unique(values[:, 1])
+    faults = []
     if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
-        faults.append(
-            Fault(
-                f"{path}: {len(values)} rows where {len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted",
-                "aero-grid",
-            )
-        )
+        wanted = f"{len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
+        faults.append(f"{path}: {len(values)} rows where {wanted}")
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
-        faults.append(
-            Fault(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers", "aero-grid")
-        )
+        faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:
-        faults.append(
-            Fault(
-                f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met", "aero-grid"
-            )
-        )
+        faults.append(f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met")
     if faults:
-        raise GateError(faults)
+        raise GateError(faults, code="aero-grid")
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
     return AeroTable(mach, np.deg2rad(alpha_deg), np.ascontiguousarray(grid))
 

@@ -417,23 +417,28 @@ def reconstruct_once(
         accelerometer_root=series[5],
         triad_root=series[6],
         findings=(*findings, *(span.finding() for span in spans), *edits),
-        provenance={
-            "flight": telemetry.name,
-            "settings": asdict(settings),
-            "start_s": float(problem.time_s[0]),
-            "end_s": float(problem.time_s[-1]),
-            "nodes": len(problem.time_s),
-            "states": problem.size,
-            "passes": passes,
-            "motion": "ballistic" if problem.motion.ballistic else "strapdown",
-            "hashes": dict(telemetry.hashes),
-            **_assumptions(telemetry),
-        },
+        provenance=_provenance(telemetry, settings, problem, passes),
         adaptation=adaptation,
         drag=drag_of_drivers(problem, reference, smoothed.triangles, path, about)
         if sensors is None
         else drag_of_readings(telemetry, path, series[0], series[1], series[3]),
     )
+
+
+def _provenance(telemetry: Telemetry, settings: Settings, problem: Problem, passes: int) -> dict[str, object]:
+    """From what a trajectory was made, and how."""
+    return {
+        "flight": telemetry.name,
+        "settings": asdict(settings),
+        "start_s": float(problem.time_s[0]),
+        "end_s": float(problem.time_s[-1]),
+        "nodes": len(problem.time_s),
+        "states": problem.size,
+        "passes": passes,
+        "motion": "ballistic" if problem.motion.ballistic else "strapdown",
+        "hashes": dict(telemetry.hashes),
+        **_assumptions(telemetry),
+    }
 
 
 def _adapted_problem(

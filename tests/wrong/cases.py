@@ -26,19 +26,19 @@ PEAK_S = 439.0  # about the peak of dynamic pressure, whatever the flight
 
 @dataclass(frozen=True)
 class Case:
-    """One wrong input; ``film`` where it needs a video, ``fused`` where the methods' agreement may show it."""
+    """One wrong input; ``film`` where it needs a video, ``filmed`` where it is seen with one too."""
 
     name: str
     suspects: tuple[str, ...]
     change: Callable[[Package], None]
     film: bool = False
-    fused: bool = False
+    filmed: bool = False
 
 
 def cases(package: Package) -> list[Case]:
     """All cases that a flight can have."""
     found = [*_clocks(), *_mountings(), *_scales(), *_radars(package), *_sites(package), *_prior(), *_spoilt(package)]
-    found += [replace(case, fused=True) for case in (*_film(), *_air(), *_vehicle())]
+    found += [replace(case, filmed=True) for case in (*_film(), *_air(), *_vehicle())]
     return [case for case in found if not case.film or package.film is not None]
 
 

@@ -46,7 +46,7 @@ class Outcome:
         return self.worst[1] > CONFIDENTLY_WRONG_SD
 
 
-def outcome_of(folder: Path, truth: Path, methods: tuple[str, ...] = METHODS) -> Outcome:
+def outcome_of(folder: Path, truth: Path) -> Outcome:
     """Check and run a folder in memory; ``truth`` is the folder of the truth's tables."""
     out = Outcome()
     report = check_folder(folder)
@@ -56,7 +56,7 @@ def outcome_of(folder: Path, truth: Path, methods: tuple[str, ...] = METHODS) ->
     out.data = [(f.code, (f.source,)) for f in report.findings if f.code != "file-not-used"]
     try:
         bet = reconstruct(read_flight(folder))
-        answers = estimate(bet, tuple(m for m in methods if m != "camera" or bet.telemetry.frames is not None))
+        answers = estimate(bet, tuple(m for m in METHODS if m != "camera" or bet.telemetry.frames is not None))
     except GateError as fault:
         out.refused += [f"run {code}" for code in fault.codes]
         return out

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from estimators.agreement import CAMERA_MISALIGNED
-from postflight.deflections import METHODS
 from tests.wrong.cases import Case, cases
 from tests.wrong.outcome import Outcome, outcome_of
 from tests.wrong.package import Package, read_package
@@ -56,13 +55,12 @@ def outcomes(package: Package, truth: Path, chosen: list[Case]) -> Iterator[tupl
     """Run cases one after the other."""
     for case in chosen:
         wrong = package.copy()
-        if not case.fused:
+        if not case.filmed:
             wrong.film = None
             wrong.spec.pop("frames", None)
         case.change(wrong)
-        methods = METHODS if case.fused else ("misalignment", "trim")
         with tempfile.TemporaryDirectory() as folder:
-            yield case, outcome_of(wrong.write(Path(folder) / "flight"), truth, methods)
+            yield case, outcome_of(wrong.write(Path(folder) / "flight"), truth)
 
 
 def row(case: Case, found: Outcome) -> tuple[str, ...]:
