@@ -26,7 +26,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle
 from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
-from postflight.flight import PULSE_RATE_HZ, Flight
+from postflight.flight import Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
 from postflight.reconciliation.fit import JointFit, mismatched_spans, require_damping, select_laws
@@ -54,7 +54,6 @@ from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from recon.consistency import ConsistencyCheck, consistency_check
-from recon.settings import Settings
 from synthetic_flight.dispersions import Factor, JointDispersions
 
 STRONG = 3.0  # logarithm of odds of twenty to one
@@ -150,7 +149,7 @@ def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconcil
 
 def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     """Reconstruct, reconcile, write a run folder and print the result."""
-    settings = {"reconcile": True, "laws": list(laws), "posterior": sampled, "output_rate_hz": 20.0}
+    settings = {"reconcile": True, "laws": list(laws), "posterior": sampled}
     if sampled:
         require_samplers()
     keep_arrays()
@@ -160,9 +159,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         require_damping(telemetry.required_vehicle())
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
-        flight = reconstruct(
-            Flight(telemetry), Settings(pulse_rate_hz=PULSE_RATE_HZ), lambda f, what: report(0.02 + 0.18 * f, what)
-        )
+        flight = reconstruct(Flight(telemetry), progress=lambda f, what: report(0.02 + 0.18 * f, what))
         second.ask(without_fit, flight)
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
@@ -176,6 +173,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
         modal, no_modes = _modes(flight, fit)
         fused, rigid = second.answer()
+        settings["output_rate_hz"] = flight.flight.settings.output_rate_hz
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(fit)
             out.write_csv("joint.csv", table)

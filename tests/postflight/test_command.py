@@ -18,9 +18,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from flightmodel.checks import GateError
 from flightmodel.files import writing
 from postflight import cli, commands
 from postflight.deflections import METHODS
+from postflight.flight import read_flight
 from postflight.plots import run_figures
 from tests.postflight.killing import kill_run, run_again, start_command
 from tests.refusing import printed_codes, refuses
@@ -95,6 +97,21 @@ def test_wrong_usage_exits_2(command, tmp_path: Path, arguments: list[str]) -> N
     assert "Error" in done.stderr
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reconciliation_has_the_settings_that_the_flight_states(command, flight, monkeypatch) -> None:
+    flight.append('[reconstruction]\nwithout = ["south"]\nstart_s = 421.0')
+    given = []
+
+    def seen(of, *_, **__):
+        given.append(of.settings)
+        raise GateError("enough", "seen")
+
+    monkeypatch.setattr("postflight.reconciliation.command.reconstruct", seen)
+    assert command("reconcile", flight.root).returncode == 3
+    assert given[0].without == ("south",)
+    assert given[0].start_s == 421.0
+    assert given[0].pulse_rate_hz == read_flight(flight.root).settings.pulse_rate_hz > 0.0
 
 
 @pytest.mark.parametrize("options", [["--without", "nort"], ["--set", "without=nort"]])
