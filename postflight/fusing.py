@@ -13,6 +13,7 @@ each method, or a posterior in which the likeliest fault's inputs are as good as
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -45,7 +46,8 @@ _FREED = 10.0  # times its stated sd an input is as good as unknown: a fault of 
 _LARGEST_LOG = 50.0  # of odds; more is rounding beside one
 _OFF_SD = 4.0
 CAMERA_PLANE_SD_RAD = np.deg2rad(1.0)  # of the camera's clocking about the axis
-_WIDE_BIAS_SD_S = 0.3  # a priori sd of a camera time bias that is stated as zero, when it is tested
+# a priori sd of a camera time bias that is stated as zero, when it is tested: of a recorder's delay; of a wrong second
+_WIDE_BIAS_SD_S = 0.3, 1.0
 
 
 @dataclass(frozen=True)
@@ -256,7 +258,7 @@ class _Sources:
 
     def shows_time_bias(self) -> bool:
         """Whether the deflection moves enough for the camera's time bias to be observed."""
-        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S), self.knot_s)
+        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S[0]), self.knot_s)
 
     @property
     def knot_s(self) -> float:
@@ -387,11 +389,10 @@ def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:
 
 def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
     """Estimate of a camera time bias stated as zero; None where there is no common answer with it free."""
-    try:
-        read = sources.reader(sources.names, _WIDE_BIAS_SD_S)
-        return _time_bias(sources.fused(read), _WIDE_BIAS_SD_S, False)
-    except DivergenceError:
-        return None
+    for sd_s in _WIDE_BIAS_SD_S:
+        with contextlib.suppress(DivergenceError):
+            return _time_bias(sources.fused(sources.reader(sources.names, sd_s)), sd_s, False)
+    return None
 
 
 def _time_bias(fused: Fused, prior_sd_s: float, applied: bool) -> CameraTimeBias:

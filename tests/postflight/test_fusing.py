@@ -71,6 +71,12 @@ def test_a_bad_film_is_left_out_and_named(name):
     assert error_sd(answer)[1] == pytest.approx(error_sd(without)[1])
 
 
+def test_a_film_that_is_early_by_most_of_a_period_has_its_time_bias():
+    bias = fuse_flight(sound(), film(motion(TIME_S + 1.5))).camera_time_bias
+    assert bias.is_off
+    assert bias.offset_s == pytest.approx(-1.5, abs=4.0 * bias.sd_s)
+
+
 def test_a_turned_accelerometer_is_left_out():
     loads = sound()
     # the force alone is turned by 2 deg, far beyond what its bias and mounting are known to; the attitude is right
