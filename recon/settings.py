@@ -103,7 +103,7 @@ class Settings:
         Of the trajectories.
     pulse_rate_hz : float
         Of the trajectories where the specific force exceeds half of the descent's largest; 0 for no other rate there,
-        so that equal spans have equal times.
+        so that equal spans have equal times. A flight's own settings have 50 where flight.toml states none.
     start_s, end_s : float or None
         Span; the data's own common span where None.
     carry_on_s : float
