@@ -496,12 +496,17 @@ class CgAccelerations:
 
 def windows_are_whole(bet: TrajectorySolution, grid: FloatArray) -> BoolArray:
     """Mask (n,) of times with sensor data on both sides and no telemetry gap near."""
-    t_imu, h = bet.imu_time_s, HALF_WINDOW_S
+    return _without_gap(bet.imu_time_s, grid, 2.0 * HALF_WINDOW_S)
+
+
+def _without_gap(t_imu: FloatArray, at: FloatArray, reach_s: float) -> BoolArray:
+    """Mask (n,) of times with sensor data to both sides and no gap beside which a mean is not of its middle."""
     if len(t_imu) < 2:
-        return np.zeros(len(grid), dtype=bool)
-    inside = (grid - 2 * h >= t_imu[0]) & (grid + 2 * h <= t_imu[-1])
-    nearest = np.searchsorted(t_imu, grid).clip(1, len(t_imu) - 1)
-    return np.asarray(inside & (t_imu[nearest] - t_imu[nearest - 1] <= 2.0 * h))
+        return np.zeros(len(at), dtype=bool)
+    gap = np.flatnonzero(np.diff(t_imu) > _LARGEST_GAP_S + 1e-6)  # tags are decimals: ten a second are not quite
+    ends = np.concatenate([[-np.inf], t_imu[gap + 1]])  # of the gap before the first there is none
+    last = ends[np.searchsorted(t_imu[gap], at + reach_s)]  # of the gaps that begin before the window ends
+    return np.asarray((at - reach_s >= t_imu[0]) & (at + reach_s <= t_imu[-1]) & (at - reach_s >= last))
 
 
 def cg_accelerations(
@@ -578,11 +583,7 @@ def _window_times(bet: TrajectorySolution) -> FloatArray:
     reach = 0.5 * _WINDOW_S + _EDGE_S
     first, last = max(t_imu[0], t_bet[0]) + reach, min(t_imu[-1], t_bet[-1]) - reach
     t = np.arange(first, last, _WINDOW_S)
-    gaps = np.flatnonzero(np.diff(t_imu) > _LARGEST_GAP_S)
-    whole = np.ones(len(t), dtype=bool)
-    for k in gaps:
-        whole &= (t + reach < t_imu[k]) | (t - reach > t_imu[k + 1])
-    return t[whole]
+    return t[_without_gap(t_imu, t, reach)]
 
 
 def _force_means(bet: TrajectorySolution, arm_body_m: FloatArray, t: FloatArray) -> FloatArray:

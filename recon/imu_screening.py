@@ -78,6 +78,11 @@ class BridgedSensor:
     findings: tuple[Finding, ...]
     offsets: tuple[TransientOffset, ...] = ()
 
+    @property
+    def of_bridge(self) -> BoolArray:
+        """Which samples (n,) are of a bridge: they have a gap on both sides."""
+        return self.in_gap & np.concatenate([[False], self.in_gap[:-1]])
+
 
 class _Unused(NamedTuple):
     """What is bridged: all times (n,), rejected values, else NaN, and at which stop samples are, 0 none (both n, k)."""

@@ -695,14 +695,12 @@ def turned_velocity_cov(velocity_mps: FloatArray, covariance: FloatArray) -> Flo
 def corrected_series(
     problem: Problem, force: BridgedSensor, rate: BridgedSensor, states: States
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (k,) and corrected specific force and rate (k, 3), body axes, at valid accelerometer samples."""
+    """Times (k,), corrected specific force and rate (k, 3), body axes, at accelerometer samples that both measure."""
     t = force.time_s
-    after_gap = np.zeros(len(t), dtype=bool)
-    after_gap[1:] = force.in_gap[:-1]
-    bridged = force.in_gap & after_gap  # samples of a bridge have a gap on both sides
     k = np.clip(np.searchsorted(rate.time_s, t, side="right") - 1, 0, len(rate.time_s) - 1)
-    in_rate_gap = rate.in_gap[k] & (t - rate.time_s[k] > 1e-6)
-    keep = ~bridged & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
+    # the sample from which a gap begins is measured; one of the other's bridge may have its time
+    in_rate_gap = rate.in_gap[k] & (rate.of_bridge[k] | (t - rate.time_s[k] > 1e-6))
+    keep = ~force.of_bridge & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
     t, measured_force = t[keep], force.measured_sensor[keep]
     specific_force, rates = np.empty((2, len(t), 3))
     for first in range(0, len(t), _BLOCK):  # eighteen errors a sample are six times the samples

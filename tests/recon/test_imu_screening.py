@@ -1,13 +1,16 @@
 """Gaps of inertial data, and samples that tell nothing new."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
+from recon.atmosphere import HALF_WINDOW_S, windows_are_whole
 from recon.imu_screening import bridge, frozen_samples
+from recon.reconstruct import corrected_series
 from tests.refusing import refuses
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)
@@ -122,3 +125,42 @@ def test_peaks_clipped_at_one_stop_err_alike():
         for b in (bridged, alone)
     ]
     assert integral_sd[0] == pytest.approx(np.sqrt(5.0) * integral_sd[1], rel=0.02)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.003])
+def test_no_reading_is_taken_from_a_bridge_of_either_sensor(late_s):
+    """A bridge has samples of its own; where both sensors' tags are the same they have the other's times."""
+    t, rng = np.arange(0.0, 10.0, 0.01), np.random.default_rng(6)
+    spec = replace(SPEC, name="accelerometer")
+    lost = [(t > 2.0) & (t < 2.5), (t + late_s > 6.0) & (t + late_s < 9.0)]
+    force, rate = (
+        bridge(TriadRecord(each, (t + late)[~gone], rng.normal(0.0, 0.01, (int((~gone).sum()), 3))), number)
+        for number, (each, late, gone) in enumerate(((spec, 0.0, lost[0]), (SPEC, late_s, lost[1])))
+    )
+    problem = SimpleNamespace(
+        time_s=np.array([0.0, 10.0]), motion=SimpleNamespace(dcm_body_force=np.eye(3), dcm_body_rate=np.eye(3))
+    )
+    read_s, _, rates = corrected_series(problem, force, rate, SimpleNamespace(sensor_errors=np.zeros((2, 18))))
+    assert np.isin(read_s, t[~lost[0]]).all()
+    # those at both ends of a gap are measured
+    wanted = t[~lost[0] & ((t <= 6.0 + 1e-9) | (t >= 9.0 + late_s - 1e-9)) & (t >= late_s)]
+    assert len(wanted) - 3 <= len(read_s) <= len(wanted)
+    assert not ((read_s > 6.0 + 1e-9) & (read_s < 9.0 - 1e-9)).any()
+    assert np.abs(rates).max() < 0.06
+
+
+def test_windows_that_reach_into_a_gap_are_left_out():
+    t = np.arange(0.0, 10.0, 0.01)
+    t = t[(t <= 4.0) | (t >= 5.0)]
+    grid = np.round(np.arange(0.0, 10.0, 0.05), 9)
+    whole = grid[windows_are_whole(SimpleNamespace(imu_time_s=t), grid)]
+    reach = 2.0 * HALF_WINDOW_S
+    assert whole[0] == pytest.approx(reach)
+    apart = np.minimum(np.abs(whole - 4.0), np.abs(whole - 5.0))
+    assert (apart > reach - 1e-9).all()
+    assert not ((whole > 4.0) & (whole < 5.0)).any()
+    assert len(whole) == pytest.approx((10.0 - 1.0 - 4.0 * reach) / 0.05, abs=4)
+    # ten samples a second in decimal tags are no gaps
+    tenths = np.round(np.arange(437.0, 447.0, 0.1), 6)
+    assert windows_are_whole(SimpleNamespace(imu_time_s=tenths), np.array([440.05, 441.0])).all()
+    assert not windows_are_whole(SimpleNamespace(imu_time_s=tenths[:1]), grid).any()

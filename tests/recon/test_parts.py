@@ -317,9 +317,12 @@ def test_two_attitudes_differ_as_both_may_err():
 def test_readings_corrected_in_blocks_are_those_corrected_at_once(monkeypatch):
     rng, t = np.random.default_rng(4), np.arange(0.0, 1.0, 0.01)
     force, rate = (
-        SimpleNamespace(time_s=t + late, in_gap=np.zeros(len(t), dtype=bool), measured_sensor=rng.normal(size=(100, 3)))
+        SimpleNamespace(
+            time_s=t + late, in_gap=np.zeros(len(t), dtype=bool), of_bridge=np.zeros(len(t), dtype=bool),
+            measured_sensor=rng.normal(size=(100, 3)),
+        )
         for late in (0.0, 0.002)
-    )
+    )  # fmt: skip
     turn = rotations.dcm_from_q(rotations.exp(np.array([0.1, -0.2, 0.3])))
     problem = SimpleNamespace(
         time_s=np.linspace(0.0, 1.0, 6), motion=SimpleNamespace(dcm_body_force=turn, dcm_body_rate=turn.T)
