@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from estimators.agreement import CAMERA_MISALIGNED
+from estimators.agreement import CAMERA_MISALIGNED, MOUNT
 from tests.wrong.cases import Case, cases
 from tests.wrong.outcome import Outcome, outcome_of
 from tests.wrong.package import Package, read_package
@@ -24,6 +24,7 @@ _INPUTS = {  # of the methods' agreement, and whose file states them
     "mass properties": "vehicle",
     "sounded wind": "atmosphere",
     "sounded density": "atmosphere",
+    MOUNT: "accelerometer",
     "frames": "camera",
     CAMERA_MISALIGNED: "camera",
 }
