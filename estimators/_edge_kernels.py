@@ -10,6 +10,9 @@ import numpy as np
 
 from flightmodel._kernels import inlined, kernel
 
+_TURNS_BESIDE = 2  # on either side of the middle of a square of turns, all of which are left out at once
+_ROUNDING_PX = 1e-9
+
 
 @inlined
 def _grey_inside(image, u, v):
@@ -44,11 +47,11 @@ def row_differences(image, tall, wide, step, one, two):
     """
     for i in range(one.shape[0]):
         for j in range(one.shape[1]):
-            near, far = 0.0, 0.0
+            near, far = 0, 0
             for row in range(i * tall, (i + 1) * tall):
                 for column in range(j * wide, (j + 1) * wide, step):
-                    a, b = float(image[row, column]), float(image[row + 1, column])
-                    c = float(image[row + 2, column])
+                    a, b = np.int32(image[row, column]), np.int32(image[row + 1, column])
+                    c = np.int32(image[row + 2, column])
                     near += (a - b) * (a - b)
                     far += (a - c) * (a - c)
             count = tall * ((wide + step - 1) // step)
@@ -70,7 +73,20 @@ def row_steps(image, step, most, out):
 def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape
+    h, w = image.shape
+    low_u, low_v = max(corner[0], 0.0), max(corner[1], 0.0)
+    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
     for i in range(n):
+        u0, v0 = origin[i, 0] + first * inward[i, 0], origin[i, 1] + first * inward[i, 1]
+        u1, v1 = u0 + (m - 1) * step * inward[i, 0], v0 + (m - 1) * step * inward[i, 1]
+        # a line whose ends lie inside does
+        if low_u < min(u0, u1) and max(u0, u1) < high_u and low_v < min(v0, v1) and max(v0, v1) < high_v:
+            for k in range(m):
+                along = first + k * step
+                u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
+                inside[i, k] = True
+                grey[i, k] = _grey_inside(image, u - corner[0], v - corner[1])
+            continue
         for k in range(m):
             along = first + k * step
             u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
@@ -235,6 +251,31 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, along, left,
 
 
 @kernel
+def square_of_model(left, good, noise, beside, square):
+    """Mean square (n,) of what step and ramp leave (n, m), of the mean over a line and ``beside`` on either side.
+
+    Beyond noise; lines that are not good count nothing.
+    """
+    n, m = left.shape
+    total, count = np.zeros(m), 0
+    for i in range(-beside, n):
+        after, before = i + beside, i - beside - 1
+        if after < n and good[after]:
+            count += 1
+            for k in range(m):
+                total[k] += left[after, k]
+        if before >= 0 and good[before]:
+            count -= 1
+            for k in range(m):
+                total[k] -= left[before, k]
+        if i >= 0:
+            per, mean = 1.0 / max(count, 1), 0.0
+            for k in range(m):
+                mean += (total[k] * per) ** 2
+            square[i] = max(mean / m - noise * noise * per, 0.0)
+
+
+@kernel
 def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
@@ -315,13 +356,35 @@ def tops(rise, least, steps):
             steps[i, j] = value > least[i] and value >= rise[i, j - 1] and value >= rise[i, j + 1]
 
 
+@inlined
+def _may_agree(hits, by_turn, slack, y, z, limits, best):
+    """Whether one of the turns about (y, z), that move points by at most ``slack`` (n,) px more, may do better.
+
+    ``hits`` (n, k + 1): how many samples before each one agree.
+    """
+    nearest, farthest, spacing, least, low = limits
+    n, k = len(by_turn), hits.shape[1] - 1
+    middle = k // 2
+    may, must = 0, 0
+    for i in range(n):
+        off, more = by_turn[i, 0] * y + by_turn[i, 1] * z, slack[i]
+        size = abs(off)
+        first = min(max(middle + round((off - more) / spacing), 0), k)
+        last = min(max(middle + round((off + more) / spacing), -1), k - 1)
+        possible = (size + more >= nearest) & (size - more <= farthest)
+        may += possible & (hits[i, last + 1] > hits[i, first])
+        must += (size - more >= nearest) & (size + more <= farthest)
+    return may >= best * max(must, least) if best > low else may > best * max(must, least)
+
+
 @kernel
 def share_of_second_edge(steps, by_turn, limits):
     """Largest share of points (n,) with a step where a turn would put them, and the turn's size, rad; or ``low`` and 0.
 
     ``steps`` (n, k): where on the line across each point, which lies in the middle, a step is found; within a pixel
     counts. ``limits``: nearest and farthest that a turn puts a point, px; samples' spacing, px; least points that it
-    puts between; share ``low`` that asks for more. Turns are tried a pixel apart for the point that moves most.
+    puts between; share ``low`` that asks for more. Turns are tried a pixel apart for the point that moves most, and of
+    equal ones the first is taken; squares of them that cannot do better are left out.
     """
     nearest, farthest, spacing, least, low = limits
     n, middle, beside = len(by_turn), steps.shape[1] // 2, round(1.0 / spacing)
@@ -332,22 +395,34 @@ def share_of_second_edge(steps, by_turn, limits):
     if n < least or most == 0.0:
         return best, size
     spread = np.zeros(steps.shape, dtype=np.bool_)
+    hits, slack = np.empty((n, steps.shape[1] + 1), dtype=np.int16), np.empty(n)
     for i in range(n):
         for j in range(steps.shape[1]):
             if steps[i, j]:
                 spread[i, max(j - beside, 0) : j + beside + 1] = True
-    reach = int(farthest)
-    for a in range(-reach, reach + 1):
-        for b in range(-reach, reach + 1):
-            y, z = a / most, b / most
-            moved, found = 0, 0
-            for i in range(n):
-                if i % 16 == 0 and found + n - i <= best * (moved + n - i):
-                    break  # were all the others to agree, it would not be the largest
-                off = by_turn[i, 0] * y + by_turn[i, 1] * z
-                if nearest <= abs(off) <= farthest:
-                    moved += 1
-                    found += spread[i, middle + round(off / spacing)]
-            if moved >= least and found > best * moved:
-                best, size = found / moved, math.hypot(y, z)
+        hits[i, 0] = 0
+        for j in range(steps.shape[1]):
+            hits[i, j + 1] = hits[i, j] + spread[i, j]
+        slack[i] = _TURNS_BESIDE * (abs(by_turn[i, 0]) + abs(by_turn[i, 1])) / most + _ROUNDING_PX
+    reach, first = int(farthest), (0, 0)
+    for middle_a in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
+        for middle_b in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
+            if not _may_agree(hits, by_turn, slack, middle_a / most, middle_b / most, limits, best):
+                continue
+            for a in range(middle_a - _TURNS_BESIDE, min(middle_a + _TURNS_BESIDE, reach) + 1):
+                for b in range(middle_b - _TURNS_BESIDE, min(middle_b + _TURNS_BESIDE, reach) + 1):
+                    y, z = a / most, b / most
+                    moved, found = 0, 0
+                    for i in range(n):
+                        if i % 16 == 0 and found + n - i < best * (moved + n - i):
+                            break  # were all the others to agree, it would not be the largest
+                        off = by_turn[i, 0] * y + by_turn[i, 1] * z
+                        if nearest <= abs(off) <= farthest:
+                            moved += 1
+                            found += spread[i, middle + round(off / spacing)]
+                    if moved < least or not found > low * moved:
+                        continue
+                    share = found / moved
+                    if share > best or (share == best and (a, b) < first):
+                        best, size, first = share, math.hypot(y, z), (a, b)
     return best, size

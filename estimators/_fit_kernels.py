@@ -10,85 +10,68 @@ import math
 import numpy as np
 
 from estimators._edge_kernels import median
-from estimators._sight_kernels import COLUMNS, feet, limb_points, project_points, rotation_of
+from estimators._sight_kernels import COLUMNS, feet, project_edge, project_points, rotation_of
 from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
 
 JOINT = COLUMNS - 1
 LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
 SHAPES = LOBES + 3  # light
 _RADIUS = COLUMNS - 2
+_AT_ONCE, _WIDE = 4, 2 + 2 + SHAPES + 1  # points; deflection, flattening, joint, shapes and a residual
 DONE, TOO_FEW, DIVERGED = 0, 1, 2
 
 
 @inlined
-def _project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept):
-    """Project the limb of the deformed shell; the number of its points in the lens's field.
-
-    They are moved to the front of ``pixels`` and ``jacobian``, their clocking angles into ``kept``.
-    """
-    rotation = terms[0]
-    position, flat = lens[5], deformation[2]
-    eye = np.empty(3)
-    dx, dy, dz = position[0] + joint, position[1], position[2]
-    for m in range(3):
-        eye[m] = rotation[0, m] * dx + rotation[1, m] * dy + rotation[2, m] * dz
-    eye[0] -= joint
-    if not limb_points(circles, ring, flat, eye, clocks, points):
-        return 0
-    per = 1.0 / (1.0 + flat * flat)
-    for i in range(len(points)):
-        r = math.sqrt(points[i, 1] ** 2 + points[i, 2] ** 2)
-        aft, outwards = -points[i, 0] - ring[0], r - ring[1]
-        scale = (ring[1] + per * (outwards + flat * aft)) / r
-        points[i, 0] = -(ring[0] + per * (aft - flat * outwards))
-        points[i, 1] *= scale
-        points[i, 2] *= scale
-    project_points(points, terms, lens, pixels, jacobian)
-    count = 0
-    for i in range(len(points)):
-        if math.isfinite(pixels[i, 0]):
-            if count < i:
-                for c in range(2):
-                    pixels[count, c] = pixels[i, c]
-                    for j in range(COLUMNS):
-                        jacobian[count, c, j] = jacobian[i, c, j]
-            kept[count] = clocks[i]
-            count += 1
-    return count
-
-
-@inlined
-def _lobe_columns(flattening, outwards, clock, shape):
-    """Derivatives by a flattening, and by a growth outwards, that vary round the shell as waves.
-
-    ``flattening``, ``outwards``: derivatives by those that do not vary.
-    """
+def _waves_round(clock, away, waves):
+    """Waves (12,) round the shell: of lobes across it, and times the distance ``away`` of those along its radius."""
     c, s = math.cos(clock), math.sin(clock)
     cosine, sine = c, s
     for wave in range(4):
         cosine, sine = cosine * c - sine * s, sine * c + cosine * s
-        shape[2 * wave], shape[2 * wave + 1] = flattening * cosine, flattening * sine
+        waves[2 * wave], waves[2 * wave + 1] = cosine, sine
         if wave < 2:
-            shape[8 + 2 * wave], shape[9 + 2 * wave] = outwards * cosine, outwards * sine
+            waves[8 + 2 * wave], waves[9 + 2 * wave] = away * cosine, away * sine
+
+
+@inlined
+def _lobe_columns(flattening, outwards, waves, shape):
+    """Derivatives by a flattening, and by a growth outwards, that vary round the shell as waves (12,).
+
+    ``flattening``, ``outwards``: derivatives by those that do not vary.
+    """
+    for j in range(8):
+        shape[j] = flattening * waves[j]
+    for j in range(8, LOBES):
+        shape[j] = outwards * waves[j]
+
+
+@inlined
+def _waves_of_spots(spots, ring, waves):
+    """Waves (p, 12) round the shell at features (p, 3)."""
+    for i in range(len(spots)):
+        radius = math.sqrt(spots[i, 1] ** 2 + spots[i, 2] ** 2)
+        away = math.sqrt((-spots[i, 0] - ring[0]) ** 2 + (radius - ring[1]) ** 2)
+        _waves_round(math.atan2(spots[i, 2], -spots[i, 1]), away, waves[i])
 
 
 @inlined
 def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at):
     """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
-    m = len(found)
+    m, waves = len(found), np.empty(LOBES)
     feet(found, pixels[:count], jacobian[:count], residual[:m], rows[:m], at)
     for i in range(m):
         residual[i] -= edge_offset[i]
         j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
         clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
-        _lobe_columns(rows[i, 2], width * rows[i, _RADIUS], clock, shape[i])
+        _waves_round(clock, width, waves)
+        _lobe_columns(rows[i, 2], rows[i, _RADIUS], waves, shape[i])
         for c in range(3):
             shape[i, LOBES + c] = light[i, c]
 
 
 @inlined
 def _feature_residuals(
-    spots, across, place, feature_offset, ring, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
+    spots, across, place, feature_offset, waves, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
 ):  # fmt: skip
     """As `_edge_residuals` for features, in the rows behind the edge's; those beyond ``outlier`` px become NaN."""
     p = len(spots)
@@ -100,10 +83,7 @@ def _feature_residuals(
             residual[m + i] = np.nan
         for c in range(COLUMNS):
             rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
-        radius = math.sqrt(spots[i, 1] ** 2 + spots[i, 2] ** 2)
-        away = math.sqrt((-spots[i, 0] - ring[0]) ** 2 + (radius - ring[1]) ** 2)
-        clock = math.atan2(spots[i, 2], -spots[i, 1])
-        _lobe_columns(rows[m + i, 2], away * rows[m + i, _RADIUS], clock, shape[m + i])
+        _lobe_columns(rows[m + i, 2], rows[m + i, _RADIUS], waves[i], shape[m + i])
         for c in range(3):
             shape[m + i, LOBES + c] = 0.0
 
@@ -150,31 +130,39 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 
 @inlined
-def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, design, normal, right):
-    """Weighted normal equations with priors, means and sd, on all but the deflection."""
-    (mean, sd), k, n = prior, basis.shape[1], len(design)
-    for a in range(n):
-        right[a] = 0.0
-        for b in range(n):
-            normal[a, b] = 0.0
-    for i in range(len(residual)):
-        if weight[i] > 0.0:
+def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, few, normal, right):
+    """Weighted normal equations with priors, means and sd, on all but the deflection.
+
+    ``few`` (4, 20): designs of as many points at once, each with its residual behind, and ``normal`` (20, 20) alike.
+    """
+    (mean, sd), k, n = prior, basis.shape[1], len(right)
+    normal[:] = 0.0
+    few[:] = 0.0
+    weights, held = np.zeros(_AT_ONCE), 0
+    for i in range(len(residual) + 1):
+        is_last = i == len(residual)
+        if not is_last and weight[i] > 0.0:
             for j in range(k):
-                design[j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
-            design[k], design[k + 1] = rows[i, 2], rows[i, JOINT]
+                few[held, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            few[held, k], few[held, k + 1] = rows[i, 2], rows[i, JOINT]
             for j in range(SHAPES):
-                design[k + 2 + j] = shape[i, j]
-            for a in range(n):
-                weighted = weight[i] * design[a]
-                right[a] += weighted * residual[i]
-                for b in range(a, n):
-                    normal[a, b] += weighted * design[b]
+                few[held, k + 2 + j] = shape[i, j]
+            few[held, _WIDE - 1] = residual[i]
+            weights[held] = weight[i]
+            held += 1
+        if held == _AT_ONCE or is_last:
+            for a in range(_WIDE):
+                w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
+                w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
+                for b in range(_WIDE):
+                    normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+            weights[:] = 0.0
+            held = 0
     for a in range(n):
+        right[a] = normal[a, _WIDE - 1]
         if a >= k:
             normal[a, a] += 1.0 / sd[a - k] ** 2
             right[a] += mean[a - k] / sd[a - k] ** 2
-        for b in range(a):
-            normal[a, b] = normal[b, a]
     # the flattening is carried from step to step, the others are counted from zero in each
     right[k] -= flattening / sd[0] ** 2
 
@@ -202,28 +190,28 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     kept, at = np.empty(len(clocks)), np.empty(m)
     rotation, columns = np.empty((3, 3)), np.empty((3, 2))
     scaled = np.empty(max(m, p))
-    design, normal, right = np.empty(n), np.empty((n, n)), np.empty(n)
+    few, normal, right = np.empty((_AT_ONCE, _WIDE)), np.empty((_WIDE, _WIDE)), np.empty(n)
+    waves = np.empty((p, LOBES))
+    _waves_of_spots(spots, ring, waves)
     form = np.zeros(1 + SHAPES)
     huber, outlier, last_step, steps, fewest = limits
     for taken in range(steps):
         rotation_of(deformation[0], deformation[1], rotation, columns)
         terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
         if m > 0:
-            count = _project_edge(
-                deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept
-            )
+            count = project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept)
             if count < 2:
                 return TOO_FEW, taken
             _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
         _feature_residuals(
-            spots, across, place, feature_offset, ring, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual,
+            spots, across, place, feature_offset, waves, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual,
             rows, shape,
         )  # fmt: skip
         _without_shape(residual, rows, shape, form, left)
         edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)
         if edges < fewest:
             return TOO_FEW, edges
-        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, design, normal, right)
+        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, few, normal, right)
         small_cholesky(normal, len(right), normal)
         small_solve(normal, len(right), right)
         step = right

@@ -21,12 +21,12 @@ _SPARSE = 10
 
 
 @inlined
-def _fisheye_sight(x, y, z, k):
-    """Normalised image point of Kannala and Brandt's lens, derivatives by x, y, z, and by k1 and k2."""
-    r2 = x * x + y * y
-    r = math.sqrt(r2)
-    a = math.atan2(r, z)
-    a2 = a * a
+def _fisheye_sight(x, y, z, r, a, k):
+    """Normalised image point of Kannala and Brandt's lens, derivatives by x, y, z, and by k1 and k2.
+
+    ``r``: distance from the axis; ``a``: angle from it.
+    """
+    r2, a2 = r * r, a * a
     distance = a * (1.0 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
     slope = 1.0 + a2 * (3.0 * k[0] + a2 * (5.0 * k[1] + a2 * (7.0 * k[2] + a2 * 9.0 * k[3])))
     per_square = 1.0 / (r2 + z * z)
@@ -92,13 +92,15 @@ def project_points(points, terms, lens, pixels, jacobian):
         x = axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz
         y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
         z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
-        if math.atan2(math.sqrt(x * x + y * y), z) >= half_field:
+        off_axis = math.sqrt(x * x + y * y)
+        angle = math.atan2(off_axis, z)
+        if angle >= half_field:
             pixels[i, 0] = pixels[i, 1] = np.nan
             for c in range(COLUMNS):
                 jacobian[i, 0, c] = jacobian[i, 1, c] = 0.0
             continue
         if model == FISHEYE:
-            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _fisheye_sight(x, y, z, k)
+            u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _fisheye_sight(x, y, z, off_axis, angle, k)
         else:
             u, v, ux, uy, uz, vx, vy, vz, uk1, vk1, uk2, vk2 = _pinhole_sight(x, y, z, k)
         pixels[i, 0], pixels[i, 1] = focal[0] * u + centre[0], focal[1] * v + centre[1]
@@ -214,6 +216,43 @@ def rotation_of(wy, wz, rotation, left):
                 left[i, j - 1] = one + c * k[i][j] + t * k2[i][j]
 
 
+@inlined
+def project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept):
+    """Project the limb of the deformed shell; the number of its points in the lens's field, -1 for a lens in a torus.
+
+    They are moved to the front of ``pixels`` and ``jacobian``, their clocking angles into ``kept``.
+    """
+    rotation = terms[0]
+    position, flat = lens[5], deformation[2]
+    eye = np.empty(3)
+    dx, dy, dz = position[0] + joint, position[1], position[2]
+    for m in range(3):
+        eye[m] = rotation[0, m] * dx + rotation[1, m] * dy + rotation[2, m] * dz
+    eye[0] -= joint
+    if not limb_points(circles, ring, flat, eye, clocks, points):
+        return -1
+    per = 1.0 / (1.0 + flat * flat)
+    for i in range(len(points)):
+        r = math.sqrt(points[i, 1] ** 2 + points[i, 2] ** 2)
+        aft, outwards = -points[i, 0] - ring[0], r - ring[1]
+        scale = (ring[1] + per * (outwards + flat * aft)) / r
+        points[i, 0] = -(ring[0] + per * (aft - flat * outwards))
+        points[i, 1] *= scale
+        points[i, 2] *= scale
+    project_points(points, terms, lens, pixels, jacobian)
+    count = 0
+    for i in range(len(points)):
+        if math.isfinite(pixels[i, 0]):
+            if count < i:
+                for c in range(2):
+                    pixels[count, c] = pixels[i, c]
+                    for j in range(COLUMNS):
+                        jacobian[count, c, j] = jacobian[i, c, j]
+            kept[count] = clocks[i]
+            count += 1
+    return count
+
+
 @kernel
 def rotation_matrix(wy, wz, rotation, left):
     """`rotation_of` for callers in Python."""
@@ -236,3 +275,45 @@ def limb(circles, ring, flat, eye, clocks, points):
 def feet_on_edge(found, vertex, jacobian, residual, rows, at):
     """`feet` for callers in Python."""
     feet(found, vertex, jacobian, residual, rows, at)
+
+
+@kernel
+def edge_at(deformation, shell, lens, pixels, jacobian, inward, kept):
+    """`project_edge` for callers in Python, with unit normals ``inward`` (n, 2) towards the shell; points kept.
+
+    ``shell``: as of `estimators._fit_kernels.fit_frame`.
+    """
+    clocks, circles, ring, _, joint = shell
+    points, rotation, columns = np.empty((len(clocks), 3)), np.empty((3, 3)), np.empty((3, 2))
+    rotation_of(deformation[0], deformation[1], rotation, columns)
+    terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
+    count = project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept)
+    for i in range(count):
+        before, after = max(i - 1, 0), min(i + 1, count - 1)
+        # clocking angles grow to the left, so the shell lies to the left along the edge
+        along_u, along_v = pixels[after, 0] - pixels[before, 0], pixels[after, 1] - pixels[before, 1]
+        length = math.sqrt(along_u * along_u + along_v * along_v)
+        inward[i, 0], inward[i, 1] = along_v / length, -along_u / length
+    return count
+
+
+@kernel
+def lines_across(clocks, kept, pixels, inward, origin, across, index):
+    """Points (m, 2) of an edge at clocking angles (m,) with its unit normals, moved to the front; their number.
+
+    Those beyond the angles ``kept`` (n,), increasing, of the edge's points are left out. ``index``: which they are.
+    """
+    count = 0
+    for i in range(len(clocks)):
+        if kept[0] <= clocks[i] <= kept[-1]:
+            j = min(np.searchsorted(kept, clocks[i], side="right"), len(kept) - 1) - 1
+            share = (clocks[i] - kept[j]) / (kept[j + 1] - kept[j])
+            for c in range(2):
+                origin[count, c] = pixels[j, c] + share * (pixels[j + 1, c] - pixels[j, c])
+                across[count, c] = inward[j, c] + share * (inward[j + 1, c] - inward[j, c])
+            length = math.sqrt(across[count, 0] ** 2 + across[count, 1] ** 2)
+            across[count, 0] /= length
+            across[count, 1] /= length
+            index[count] = i
+            count += 1
+    return count

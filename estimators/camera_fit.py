@@ -218,16 +218,16 @@ class OrientedCamera(FrameModel):
 
     def _doubled(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> float:
         """Share of edge points that agree on a second edge; a frame that shows one is refused, by `estimators.edge`."""
-        rows = edge_residuals(self.view, horizon, deformation).rows
+        rows = self.view.mismatch(horizon, self.view.edge(deformation))[1]
         seen = np.asarray(np.isfinite(rows).all(axis=1))
-        share, fault = second_edge(frame.image, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
+        share, fault = second_edge(frame.smoothed, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
         if fault:
             raise NoFitError(fault)
         return share
 
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
         """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""
-        steepness = steepness_of(frame.image, horizon)
+        steepness = steepness_of(frame.smoothed, horizon)
         # no comparison with NaN is true: of too few points nothing is said
         if min(steepness, self.steepness) < _AS_SHARP * max(steepness, self.steepness):
             raise NoFitError(

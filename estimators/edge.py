@@ -70,6 +70,7 @@ _LEAST_STEP, _OF_SCATTER = 0.05, 3.0  # of the first edge's step; of the scatter
 _ENOUGH_POINTS, _LEAST_POINTS, _LEAST_PART = 120, 30, 0.3  # looked at; that a turn moves far enough, and of all
 _DOUBLED, _BEYOND_RING = 0.55, 0.2  # a turn shares some of a ring's points, where it moves them as far
 LIKE_DOUBLED = 0.36  # a frame that may be; one of 850 sound ones of 37 films is
+_MORE_PX = 20  # that a second edge is looked for beyond the first
 _ACROSS_PX = 2.0  # on either side of an edge's middle: more of the shell has shades of its own
 
 
@@ -185,7 +186,10 @@ def _fault_of_fields(image: Image) -> Fault:
     shape = (image.shape[0] - 2) // _BLOCK_PX[0], image.shape[1] // _BLOCK_PX[1]
     one, two = np.empty(shape), np.empty(shape)
     _edge_kernels.row_differences(image, *_BLOCK_PX, _BLOCK_STEP_PX, one, two)
-    combed = int(np.sum((one > _COMBED * two) & (one > _OF_NOISE * np.median(one) + _LEAST_CONTRAST**2)))
+    differ = (one > _COMBED * two) & (one > _LEAST_CONTRAST**2)
+    if np.count_nonzero(differ) <= _MOST_COMBED * one.size:
+        return NO_FAULT
+    combed = int(np.sum(differ & (one > _OF_NOISE * np.median(one) + _LEAST_CONTRAST**2)))
     if combed > _MOST_COMBED * one.size:
         words = (
             f"its rows in turns are of two moments, in {100.0 * combed / one.size:.0f} % of the picture: deinterlace it"
@@ -201,10 +205,12 @@ def breaks_across(image: Image) -> NDArray[np.intp]:
     """
     steps = np.empty(len(image) - 1)
     _edge_kernels.row_steps(image, _BREAK_STEP_PX, _BREAK_MOST, steps)
-    beside = np.lib.stride_tricks.sliding_window_view(
-        np.pad(steps, _BREAK_BESIDE, mode="reflect"), 2 * _BREAK_BESIDE + 1
-    )
-    return np.flatnonzero(steps > 2.0 * np.median(beside, axis=1) + _BREAK_OVER)
+    rows = np.flatnonzero(steps > _BREAK_OVER)
+    # the picture's ends are mirrored
+    around = np.abs(rows[:, None] + np.arange(-_BREAK_BESIDE, _BREAK_BESIDE + 1))
+    last = len(steps) - 1
+    beside = steps[np.where(around > last, 2 * last - around, around)]
+    return rows[steps[rows] > 2.0 * np.median(beside, axis=1) + _BREAK_OVER]
 
 
 def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
@@ -238,7 +244,7 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     )
 
 
-def _lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _lasting_rises(image: Image | Smoothed, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
     grey, inside = sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
@@ -255,12 +261,12 @@ def _lasting_rises(image: Image, lines: ScanLines) -> tuple[FloatArray, FloatArr
     return STEP_PX * place - lines.outer_px, sd, good
 
 
-def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
+def steps_near(image: Image | Smoothed, lines: ScanLines) -> HorizonLine:
     """Find the edge where it is expected within a few pixels, darker or brighter than what lies behind it.
 
     Parameters
     ----------
-    image : (h, w) uint8
+    image : (h, w) uint8, or `Smoothed`
     lines : ScanLines
         With origins where the edge is expected; their lengths are not used.
     """
@@ -275,23 +281,12 @@ def steps_near(image: Image, lines: ScanLines) -> HorizonLine:
     _edge_kernels.steps_near(
         grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, along, left, good
     )  # fmt: skip
-    sd = along * np.sqrt(_NOISE_TOGETHER * noise**2 + _MODEL_TOGETHER * _square_of_model(left, good, noise))
+    # clouds and shades are on neighbouring lines alike, noise differs
+    square = np.empty(n)
+    _edge_kernels.square_of_model(left, good, noise, _NEIGHBOURS, square)
+    sd = along * np.sqrt(_NOISE_TOGETHER * noise**2 + _MODEL_TOGETHER * square)
     points = near.origin_px + place[:, None] * near.inward_px
     return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
-
-
-def _square_of_model(left: FloatArray, good: BoolArray, noise: float) -> FloatArray:
-    """Mean square (n,) of what step and ramp do not explain on lines (n, m), beyond noise.
-
-    Of the mean over a line and its neighbours: clouds and shades are on all of them, noise differs.
-    """
-    sums = np.cumsum(np.vstack([np.zeros(left.shape[1] + 1), np.column_stack([left, good]) * good[:, None]]), axis=0)
-    first = np.maximum(np.arange(len(left)) - _NEIGHBOURS, 0)
-    last = np.minimum(np.arange(len(left)) + _NEIGHBOURS + 1, len(left))
-    near = sums[last] - sums[first]
-    count = np.maximum(near[:, -1], 1.0)
-    square = np.mean((near[:, :-1] / count[:, None]) ** 2, axis=1)
-    return np.asarray(np.maximum(square - noise**2 / count, 0.0))
 
 
 def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
@@ -324,22 +319,50 @@ def middle_of(values: FloatArray) -> float:
     return float(sorted_in[half] if len(flat) % 2 else 0.5 * (sorted_in[:half].max() + sorted_in[half]))
 
 
-def sampled(image: Image, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
+class Smoothed:
+    """A picture whose smoothed grey levels are kept, band by band, for those who look at it again.
+
+    Parameters
+    ----------
+    image : (h, w) uint8
+    """
+
+    def __init__(self, image: Image) -> None:
+        self.image = image
+        self._low, self._high = np.zeros(2, dtype=int), np.zeros(2, dtype=int)
+        self._kept: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+
+    def band(self, low: NDArray[np.intp], high: NDArray[np.intp]) -> tuple[NDArray[np.float32], FloatArray]:
+        """Smoothed levels from the pixel ``low`` (2,) up to ``high``, or of more, and which pixel comes first."""
+        if np.any(low < self._low) or np.any(high > self._high):
+            h, w = self.image.shape
+            self._low, self._high = np.maximum(low - _MORE_PX, 0), np.minimum(high + _MORE_PX, [w, h])
+            band = self.image[self._low[1] : self._high[1], self._low[0] : self._high[0]]
+            self._kept = np.asarray(cv2.sepFilter2D(band, cv2.CV_32F, _SMOOTHING, _SMOOTHING))
+        return self._kept, self._low.astype(float)
+
+
+def smoothed(image: Image | Smoothed) -> Smoothed:
+    """Return a picture whose smoothed grey levels are kept."""
+    return image if isinstance(image, Smoothed) else Smoothed(image)
+
+
+def sampled(image: Image | Smoothed, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
     """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
-    h, w = image.shape
-    ends = np.concatenate([lines.origin_px - lines.outer_px * lines.inward_px,
-                           lines.origin_px + lines.inner_px * lines.inward_px])  # fmt: skip
+    picture = smoothed(image)
+    h, w = picture.image.shape
+    outer, inner = lines.outer_px * lines.inward_px, lines.inner_px * lines.inward_px
+    ends = np.concatenate([lines.origin_px - outer, lines.origin_px + inner])
     # only the band that the lines cross is smoothed
     low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
     high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
-    band = image[low[1] : high[1], low[0] : high[0]]
-    smooth = cv2.sepFilter2D(band, cv2.CV_32F, _SMOOTHING, _SMOOTHING)
+    smooth, corner = picture.band(low, high)
     n = len(lines.origin_px)
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
-    size, corner = np.array([w, h], dtype=float), low.astype(float)
     _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, grey, inside
-    )
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, np.array([w, h], dtype=float),
+        grey, inside,
+    )  # fmt: skip
     return grey, inside
 
 
@@ -362,7 +385,7 @@ NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
 NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)
 
 
-def steepness_of(image: Image, horizon: HorizonLine) -> float:
+def steepness_of(image: Image | Smoothed, horizon: HorizonLine) -> float:
     """How sharp is the edge: the grey levels' rise over its middle pixel, as a share of that over 4 px.
 
     Of all points together, so that noise has little part in it: a third of a sharp step after the smoothing, a quarter
@@ -370,7 +393,7 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
 
     Parameters
     ----------
-    image : (h, w) uint8
+    image : (h, w) uint8, or `Smoothed`
     horizon : HorizonLine
     """
     if len(horizon.points_px) < _LEAST_POINTS:
@@ -385,12 +408,14 @@ def steepness_of(image: Image, horizon: HorizonLine) -> float:
     return float(np.sign(whole) @ (levels[:, middle + half] - levels[:, middle - half]) / np.abs(whole).sum())
 
 
-def second_edge(image: Image, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray) -> tuple[float, Fault]:
+def second_edge(
+    image: Image | Smoothed, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
+) -> tuple[float, Fault]:
     """Share of edge points that agree on a second edge, zero where it is usual; why it is two pictures, if it is.
 
     Parameters
     ----------
-    image : (h, w) uint8
+    image : (h, w) uint8, or `Smoothed`
     horizon : HorizonLine
         Edge points, ``n`` in all.
     by_turn : (n, 2) float

@@ -70,9 +70,12 @@ class Design:
         """
         turned = by.T * self.weight
         crossed = turned @ self.columns @ self.gain
-        covariance = np.linalg.pinv(turned @ by - crossed @ by, hermitian=True)
-        motion = covariance @ (turned - crossed) @ self.residual_px
-        return motion, float(motion @ np.linalg.solve(covariance + allowed**2 * np.eye(len(motion)), motion))
+        inverse, right = turned @ by - crossed @ by, (turned - crossed) @ self.residual_px
+        # along the axes of the inverse covariance, where it says anything
+        value, axes = np.linalg.eigh(inverse)
+        along, known = axes.T @ right, value > len(value) * np.finfo(float).eps * value[-1]
+        along, value = along[known], value[known]
+        return axes[:, known] @ (along / value), float(np.sum(along**2 / (value * (1.0 + allowed**2 * value))))
 
 
 def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> Fault:

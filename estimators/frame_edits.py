@@ -16,12 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.edge import HorizonLine, ScanLines, find_horizon, steps_near
+from estimators.edge import HorizonLine, ScanLines, Smoothed, find_horizon, steps_near
 from estimators.features import Features
 from estimators.texture import surface_seen
 from estimators.virtual_camera import VirtualCamera
@@ -95,6 +96,11 @@ class EditedFrame:
     rim_px: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     features_px: Mapping[str, FloatArray] = field(default_factory=dict)
 
+    @cached_property
+    def smoothed(self) -> Smoothed:
+        """The picture with what was smoothed of it."""
+        return Smoothed(self.image)
+
     @property
     def has_marked_edge(self) -> bool:
         """Whether the edge was marked by hand."""
@@ -106,7 +112,7 @@ class EditedFrame:
 
     def near_edge(self, lines: ScanLines) -> HorizonLine:
         """Edge within a few pixels of where it is expected; see `steps_near`."""
-        return self._edge(steps_near(self.image, lines), lines)
+        return self._edge(steps_near(self.smoothed, lines), lines)
 
     def _edge(self, found: HorizonLine, lines: ScanLines) -> HorizonLine:
         if self.has_marked_edge:

@@ -279,6 +279,19 @@ class FrameModel:
         self, index: NDArray[np.intp], beside: int = 0
     ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
         """Of points found at the benchmark too, or so many places beside it: residual (NaN where not), sd, its row."""
+        if beside:
+            return self._nearest_at_benchmark(index, beside)
+        offset, sd, at = self._every_place_at_benchmark
+        return offset[index], sd[index], at[index]
+
+    @cached_property
+    def _every_place_at_benchmark(self) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+        """`_at_benchmark` of all places of the edge and rows of features."""
+        return self._nearest_at_benchmark(np.arange(len(self.clocks_rad) + len(self.features.across_px)), 0)
+
+    def _nearest_at_benchmark(
+        self, index: NDArray[np.intp], beside: int
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
         before = self.benchmark_residuals
         last = len(before.index) - 1
         at = np.minimum(np.searchsorted(before.index, index), last)

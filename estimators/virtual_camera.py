@@ -109,7 +109,7 @@ class VirtualCamera:
         """Radius within which the centerbody hides what lies behind; the lens may sit on the skin itself."""
         return min(self.geometry.centerbody_radius_m, float(np.hypot(*self.camera.position_body_m[1:])) - 1e-3)
 
-    @property
+    @cached_property
     def shell_terms(self) -> tuple[FloatArray, FloatArray, tuple[float, float], float, float]:
         """The shell in the compiled fit: see `estimators._fit_kernels.fit_frame`."""
         return self.clocks_rad, self._circles, self._ring, self.width_m, self.joint_station_m
@@ -170,39 +170,23 @@ class VirtualCamera:
         GateError
             Where the edge is out of the camera's view.
         """
-        rotation, _ = self._rotation(deformation)
-        eye = rotation.T @ (self.camera.position_body_m - self.joint_m) + self.joint_m
-        points, flat = np.empty((len(self.clocks_rad), 3)), float(deformation[2])
-        if not _sight_kernels.limb(self._circles, self._ring, flat, eye, self.clocks_rad, points):
+        n = len(self.clocks_rad)
+        pixels, jacobian, inward, kept = np.empty((n, 2)), np.empty((n, 2, 16)), np.empty((n, 2)), np.empty(n)
+        count = _sight_kernels.edge_at(
+            np.asarray(deformation, dtype=float), self.shell_terms, self.camera.lens_terms, pixels, jacobian, inward,
+            kept,
+        )  # fmt: skip
+        if count < 0:
             raise GateError(
-                f"the camera at {np.round(eye, 3).tolist()} m lies inside the outermost torus",
+                f"the camera at {np.round(self.camera.position_body_m, 3).tolist()} m lies inside the outermost torus",
                 code="camera-inside-shell",
             )
-        sight = self.sight(self._unflattened(points, flat), deformation)
-        inside = np.isfinite(sight.pixels[:, 0])
-        pixels = sight.pixels[inside]
-        if len(pixels) < 3:
+        if count < 3:
             raise GateError(
                 "the camera does not see the shell's edge; check its mount and lens in the vehicle file",
                 "edge-out-of-view",
             )
-        tangent = np.empty_like(pixels)
-        tangent[1:-1] = pixels[2:] - pixels[:-2]
-        tangent[0], tangent[-1] = pixels[1] - pixels[0], pixels[-1] - pixels[-2]
-        tangent /= np.hypot(tangent[:, 0], tangent[:, 1])[:, None]
-        # clocking angles grow to the left, so the shell lies to the left along the edge
-        inward = np.column_stack([tangent[:, 1], -tangent[:, 0]])
-        return ProjectedEdge(pixels, sight.jacobian[inside], inward, self.clocks_rad[inside])
-
-    def _unflattened(self, points: FloatArray, flattening: float) -> FloatArray:
-        """Points ``(n, 3)`` of the shell before it flattened."""
-        station, radius = self._ring
-        r = np.hypot(points[:, 1], points[:, 2])
-        aft, outwards = -points[:, 0] - station, r - radius
-        per = 1.0 / (1.0 + flattening**2)
-        scale = (radius + per * (outwards + flattening * aft)) / r
-        x = -(station + per * (aft - flattening * outwards))
-        return np.column_stack([x, scale * points[:, 1], scale * points[:, 2]])
+        return ProjectedEdge(pixels[:count], jacobian[:count], inward[:count], kept[:count])
 
     def edge_clocks(self) -> FloatArray:
         """Clocking angles of places spread evenly along the undeflected edge, inside the picture and off its border."""
@@ -219,13 +203,12 @@ class VirtualCamera:
     def lines_at(self, clocks_rad: FloatArray, deformation: FloatArray) -> ScanLines:
         """Scan lines normal to the edge of a deformation (3,) at clocking angles; those out of the field left out."""
         edge = self.edge(deformation)
-        index = np.flatnonzero((clocks_rad >= edge.clocks_rad[0]) & (clocks_rad <= edge.clocks_rad[-1]))
-        both = (edge.pixels, edge.inward_px)
-        origin, inward = (
-            np.column_stack([np.interp(clocks_rad[index], edge.clocks_rad, a[:, k]) for k in (0, 1)]) for a in both
+        n = len(clocks_rad)
+        origin, across, index = np.empty((n, 2)), np.empty((n, 2)), np.empty(n, dtype=np.intp)
+        count = _sight_kernels.lines_across(
+            clocks_rad, edge.clocks_rad, edge.pixels, edge.inward_px, origin, across, index
         )
-        inward /= np.linalg.norm(inward, axis=1, keepdims=True)
-        return ScanLines(origin, inward, _OUTER_PX, _INNER_PX, index)
+        return ScanLines(origin[:count], across[:count], _OUTER_PX, _INNER_PX, index[:count])
 
     def mismatch(self, horizon: HorizonLine, edge: ProjectedEdge) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals of found edge points against a projected edge.

@@ -94,7 +94,7 @@ class Camera:
             raise GateError("camera.dcm_cam_body: not a rotation matrix", code="camera-rotation")
         object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion, self.lens))
 
-    @property
+    @cached_property
     def lens_terms(self) -> tuple[int, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """What a compiled projection wants: see `estimators._sight_kernels.project_shell`."""
         coefficients = np.zeros(5)
