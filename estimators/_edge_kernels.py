@@ -30,70 +30,6 @@ def _grey_at(image, u, v):
     return _grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
 
 
-@kernel
-def grey_histogram(image, rows, columns, count):
-    """Count grey levels (256,) of every ``rows``-th row and ``columns``-th column."""
-    count[:] = 0
-    for i in range(0, image.shape[0], rows):
-        for j in range(0, image.shape[1], columns):
-            count[image[i, j]] += 1
-
-
-@kernel
-def row_differences(image, tall, wide, step, one, two):
-    """Mean square difference of rows next to each other, and of every other row, in blocks of ``tall`` x ``wide`` px.
-
-    Of every ``step``-th column.
-    """
-    for i in range(one.shape[0]):
-        for j in range(one.shape[1]):
-            near, far = 0, 0
-            for row in range(i * tall, (i + 1) * tall):
-                for column in range(j * wide, (j + 1) * wide, step):
-                    a, b = np.int32(image[row, column]), np.int32(image[row + 1, column])
-                    c = np.int32(image[row + 2, column])
-                    near += (a - b) * (a - b)
-                    far += (a - c) * (a - c)
-            count = tall * ((wide + step - 1) // step)
-            one[i, j], two[i, j] = near / count, far / count
-
-
-@kernel
-def row_steps(image, step, most, out):
-    """Mean difference (h - 1,) of every row from the next, of every ``step``-th column, at most ``most`` a pixel."""
-    for i in range(len(out)):
-        total, count = 0.0, 0
-        for j in range(0, image.shape[1], step):
-            total += min(abs(float(image[i + 1, j]) - float(image[i, j])), most)
-            count += 1
-        out[i] = total / count
-
-
-@kernel
-def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
-    """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
-    n, m = grey.shape
-    h, w = image.shape
-    low_u, low_v = max(corner[0], 0.0), max(corner[1], 0.0)
-    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
-    for i in range(n):
-        u0, v0 = origin[i, 0] + first * inward[i, 0], origin[i, 1] + first * inward[i, 1]
-        u1, v1 = u0 + (m - 1) * step * inward[i, 0], v0 + (m - 1) * step * inward[i, 1]
-        # a line whose ends lie inside does
-        if low_u < min(u0, u1) and max(u0, u1) < high_u and low_v < min(v0, v1) and max(v0, v1) < high_v:
-            for k in range(m):
-                along = first + k * step
-                u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
-                inside[i, k] = True
-                grey[i, k] = _grey_inside(image, u - corner[0], v - corner[1])
-            continue
-        for k in range(m):
-            along = first + k * step
-            u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
-            inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-            grey[i, k] = _grey_at(image, u - corner[0], v - corner[1])
-
-
 @inlined
 def median(values, count):
     """Median of the first values, whose order changes (selection by C. A. R. Hoare)."""
@@ -120,6 +56,116 @@ def median(values, count):
     for i in range(1, half):
         below = max(below, values[i])
     return 0.5 * (below + values[half])
+
+
+@kernel
+def grey_levels(image):
+    """Grey levels that 5 and 95 % of the pixels do not exceed, and the share at full scale (254 and more).
+
+    Of every fourth column, and of every eighth row; the share of every fourth.
+    """
+    count, full, seen = np.zeros(256, dtype=np.int64), 0, 0
+    for i in range(0, image.shape[0], 4):
+        for j in range(0, image.shape[1], 4):
+            full += image[i, j] >= 254
+            seen += 1
+            if i % 8 == 0:
+                count[image[i, j]] += 1
+    low, high, below, total = -1, -1, 0, count.sum()
+    for level in range(256):
+        below += count[level]
+        if low < 0 and below > 0.05 * total:
+            low = level
+        if high < 0 and below > 0.95 * total:
+            high = level
+    return low, high, full / seen
+
+
+@kernel
+def row_differences(image, tall, wide, step, most, one, two, steps):
+    """How rows differ, of every ``step``-th column.
+
+    ``one``, ``two``: mean square difference of rows next to each other, and of every other row, in blocks of ``tall`` x
+    ``wide`` px. ``steps`` (h - 1,): mean difference of every row from the next, at most ``most`` a pixel.
+    """
+    h = image.shape[0]
+    across = wide // step
+    columns, used = (image.shape[1] + step - 1) // step, one.shape[1] * across
+    line = np.zeros((3, columns), dtype=np.int32)
+    near, far = np.zeros(columns, dtype=np.int32), np.zeros(columns, dtype=np.int32)
+    for i in range(h):
+        new = line[i % 3]
+        for j in range(columns):
+            new[j] = image[i, j * step]
+        if i > 0:
+            total, before = 0, line[(i - 1) % 3]
+            for j in range(columns):
+                total += min(abs(new[j] - before[j]), most)
+            steps[i - 1] = total / columns
+        if i > 1 and (i - 2) // tall < one.shape[0]:
+            first, second = line[(i - 2) % 3], line[(i - 1) % 3]
+            for j in range(used):
+                near[j] += (first[j] - second[j]) * (first[j] - second[j])
+                far[j] += (first[j] - new[j]) * (first[j] - new[j])
+            if (i - 1) % tall == 0:
+                block = (i - 2) // tall
+                for c in range(one.shape[1]):
+                    of_near, of_far = 0, 0
+                    for j in range(c * across, (c + 1) * across):
+                        of_near += near[j]
+                        of_far += far[j]
+                    one[block, c], two[block, c] = of_near / (tall * across), of_far / (tall * across)
+                near[:] = 0
+                far[:] = 0
+
+
+@kernel
+def breaks(steps, beside, over, found):
+    """Mark steps (n,) of more than ``over`` over twice the median of those ``beside``, of mirrored ends."""
+    n = len(steps)
+    for i in range(n):
+        most, below = 0.5 * (steps[i] - over), 0
+        if most > 0.0:
+            for j in range(i - beside, i + beside + 1):
+                k = abs(j)
+                below += steps[2 * (n - 1) - k if k > n - 1 else k] < most
+        found[i] = below > beside
+
+
+@kernel
+def band_of_lines(origin, inward, outer, inner, low, high):
+    """Smallest and largest coordinates (2,) of lines that reach so far to both sides of their origins (n, 2)."""
+    low[:] = np.inf
+    high[:] = -np.inf
+    for i in range(len(origin)):
+        for c in range(2):
+            a, b = origin[i, c] - outer * inward[i, c], origin[i, c] + inner * inward[i, c]
+            low[c], high[c] = min(low[c], a, b), max(high[c], a, b)
+
+
+@kernel
+def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
+    """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
+    n, m = grey.shape
+    h, w = image.shape
+    low_u, low_v = max(corner[0], 0.0), max(corner[1], 0.0)
+    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
+    for i in range(n):
+        u0, v0 = origin[i, 0] + first * inward[i, 0], origin[i, 1] + first * inward[i, 1]
+        u1, v1 = u0 + (m - 1) * step * inward[i, 0], v0 + (m - 1) * step * inward[i, 1]
+        # a line whose ends lie inside does
+        if low_u < min(u0, u1) and max(u0, u1) < high_u and low_v < min(v0, v1) and max(v0, v1) < high_v:
+            for k in range(m):
+                along = first + k * step
+                u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
+                inside[i, k] = True
+                grey[i, k] = _grey_inside(image, u - corner[0], v - corner[1])
+            continue
+        for k in range(m):
+            along = first + k * step
+            u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
+            inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
+            grey[i, k] = _grey_at(image, u - corner[0], v - corner[1])
 
 
 @kernel
@@ -357,23 +403,27 @@ def tops(rise, least, steps):
 
 
 @inlined
-def _may_agree(hits, by_turn, slack, y, z, limits, best):
-    """Whether one of the turns about (y, z), that move points by at most ``slack`` (n,) px more, may do better.
+def _may_agree(hits, turns, able, y, z, limits, best):
+    """Whether one of the turns about (y, z) may do better; the last ``able`` points may agree with some turn.
 
-    ``hits`` (n, k + 1): how many samples before each one agree.
+    ``hits`` (n, k + 1): how many samples before each one agree; ``turns`` (n, 3): derivatives by a turn, and the most,
+    px, that the turns about the middle one move a point by beyond it.
     """
     nearest, farthest, spacing, least, low = limits
-    n, k = len(by_turn), hits.shape[1] - 1
-    middle = k // 2
+    n, k = len(turns), hits.shape[1] - 1
+    middle = k // 2 + 0.5
     may, must = 0, 0
     for i in range(n):
-        off, more = by_turn[i, 0] * y + by_turn[i, 1] * z, slack[i]
+        if i % 16 == 0 and may + min(able, n - i) < best * max(must, least):
+            return False
+        off, more = turns[i, 0] * y + turns[i, 1] * z, turns[i, 2]
         size = abs(off)
-        first = min(max(middle + round((off - more) / spacing), 0), k)
-        last = min(max(middle + round((off + more) / spacing), -1), k - 1)
-        possible = (size + more >= nearest) & (size - more <= farthest)
-        may += possible & (hits[i, last + 1] > hits[i, first])
         must += (size - more >= nearest) & (size + more <= farthest)
+        if n - i <= able:
+            first = min(max(int(middle + (off - more) / spacing), 0), k)
+            last = min(max(int(middle + (off + more) / spacing), -1), k - 1)
+            possible = (size + more >= nearest) & (size - more <= farthest)
+            may += possible & (hits[i, last + 1] > hits[i, first])
     return may >= best * max(must, least) if best > low else may > best * max(must, least)
 
 
@@ -387,7 +437,8 @@ def share_of_second_edge(steps, by_turn, limits):
     equal ones the first is taken; squares of them that cannot do better are left out.
     """
     nearest, farthest, spacing, least, low = limits
-    n, middle, beside = len(by_turn), steps.shape[1] // 2, round(1.0 / spacing)
+    n, width = steps.shape
+    middle, beside = width // 2, round(1.0 / spacing)
     most = 0.0
     for i in range(n):
         most = max(most, math.hypot(by_turn[i, 0], by_turn[i, 1]))
@@ -395,31 +446,39 @@ def share_of_second_edge(steps, by_turn, limits):
     if n < least or most == 0.0:
         return best, size
     spread = np.zeros(steps.shape, dtype=np.bool_)
-    hits, slack = np.empty((n, steps.shape[1] + 1), dtype=np.int16), np.empty(n)
+    hits, turns = np.zeros((n, width + 1), dtype=np.int16), np.empty((n, 3))
+    # lines without a step far enough from the first agree with no turn: they come first
+    near, able = int(nearest / spacing) - beside - 1, 0
     for i in range(n):
-        for j in range(steps.shape[1]):
+        has = False
+        for j in range(width):
+            has = has or (steps[i, j] and abs(j - middle) > near)
+        able += has
+        row = n - able if has else i - able
+        turns[row, 0], turns[row, 1] = by_turn[i, 0], by_turn[i, 1]
+        turns[row, 2] = _TURNS_BESIDE * (abs(by_turn[i, 0]) + abs(by_turn[i, 1])) / most + _ROUNDING_PX
+        for j in range(width):
             if steps[i, j]:
-                spread[i, max(j - beside, 0) : j + beside + 1] = True
-        hits[i, 0] = 0
-        for j in range(steps.shape[1]):
-            hits[i, j + 1] = hits[i, j] + spread[i, j]
-        slack[i] = _TURNS_BESIDE * (abs(by_turn[i, 0]) + abs(by_turn[i, 1])) / most + _ROUNDING_PX
+                spread[row, max(j - beside, 0) : j + beside + 1] = True
+        for j in range(width):
+            hits[row, j + 1] = hits[row, j] + spread[row, j]
     reach, first = int(farthest), (0, 0)
     for middle_a in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
         for middle_b in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
-            if not _may_agree(hits, by_turn, slack, middle_a / most, middle_b / most, limits, best):
+            if not _may_agree(hits, turns, able, middle_a / most, middle_b / most, limits, best):
                 continue
             for a in range(middle_a - _TURNS_BESIDE, min(middle_a + _TURNS_BESIDE, reach) + 1):
                 for b in range(middle_b - _TURNS_BESIDE, min(middle_b + _TURNS_BESIDE, reach) + 1):
                     y, z = a / most, b / most
                     moved, found = 0, 0
                     for i in range(n):
-                        if i % 16 == 0 and found + n - i < best * (moved + n - i):
+                        left = min(able, n - i)
+                        if i % 16 == 0 and found + left < best * (moved + left):
                             break  # were all the others to agree, it would not be the largest
-                        off = by_turn[i, 0] * y + by_turn[i, 1] * z
+                        off = turns[i, 0] * y + turns[i, 1] * z
                         if nearest <= abs(off) <= farthest:
                             moved += 1
-                            found += spread[i, middle + round(off / spacing)]
+                            found += spread[i, int(middle + 0.5 + off / spacing)]
                     if moved < least or not found > low * moved:
                         continue
                     share = found / moved

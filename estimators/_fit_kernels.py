@@ -130,12 +130,35 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 
 @inlined
+def _add_points(few, weights, normal):
+    """Add weighted products of points' columns (4, 20) to normal equations (20, 20)."""
+    for a in range(_WIDE):
+        w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
+        w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
+        for b in range(_WIDE):
+            normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+
+
+@inlined
+def _add_prior(prior, flattening, k, normal, right):
+    """Take the right side (n,) out of the last column, and add means and sd on all but ``k`` of a deflection."""
+    mean, sd = prior
+    for a in range(len(right)):
+        right[a] = normal[a, _WIDE - 1]
+        if a >= k:
+            normal[a, a] += 1.0 / sd[a - k] ** 2
+            right[a] += mean[a - k] / sd[a - k] ** 2
+    # the flattening is carried from step to step, the others are counted from zero in each
+    right[k] -= flattening / sd[0] ** 2
+
+
+@inlined
 def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, few, normal, right):
     """Weighted normal equations with priors, means and sd, on all but the deflection.
 
     ``few`` (4, 20): designs of as many points at once, each with its residual behind, and ``normal`` (20, 20) alike.
     """
-    (mean, sd), k, n = prior, basis.shape[1], len(right)
+    k = basis.shape[1]
     normal[:] = 0.0
     few[:] = 0.0
     weights, held = np.zeros(_AT_ONCE), 0
@@ -151,20 +174,10 @@ def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, f
             weights[held] = weight[i]
             held += 1
         if held == _AT_ONCE or is_last:
-            for a in range(_WIDE):
-                w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
-                w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
-                for b in range(_WIDE):
-                    normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+            _add_points(few, weights, normal)
             weights[:] = 0.0
             held = 0
-    for a in range(n):
-        right[a] = normal[a, _WIDE - 1]
-        if a >= k:
-            normal[a, a] += 1.0 / sd[a - k] ** 2
-            right[a] += mean[a - k] / sd[a - k] ** 2
-    # the flattening is carried from step to step, the others are counted from zero in each
-    right[k] -= flattening / sd[0] ** 2
+    _add_prior(prior, flattening, k, normal, right)
 
 
 @kernel
@@ -229,3 +242,60 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
         if largest < last_step:
             break
     return DONE, taken + 1
+
+
+@kernel
+def solved(columns, residual, weight, prior, flattening, formal, found):
+    """Formal covariance (n, n) of a weighted least-squares step and the step ``found`` (n,), with the priors.
+
+    ``columns`` (m, n): derivatives by deflection, flattening, joint, lobes and light. ``prior``: mean and sd of all but
+    the deflection, the flattening's about ``flattening``, which comes on top of the step.
+    """
+    m, n = columns.shape
+    few, normal, weights = np.zeros((_AT_ONCE, _WIDE)), np.zeros((_WIDE, _WIDE)), np.zeros(_AT_ONCE)
+    for first in range(0, m, _AT_ONCE):
+        for held in range(_AT_ONCE):
+            i = first + held
+            weights[held] = 0.0
+            if i < m:
+                weights[held] = weight[i]
+                for a in range(n):
+                    few[held, a] = columns[i, a]
+                few[held, _WIDE - 1] = residual[i]
+        _add_points(few, weights, normal)
+    _add_prior(prior, flattening, n - len(prior[0]), normal, found)
+    small_cholesky(normal, n, normal)
+    small_solve(normal, n, found)
+    unit = np.empty(n)
+    for a in range(n):
+        unit[:] = 0.0
+        unit[a] = 1.0
+        small_solve(normal, n, unit)
+        for b in range(n):
+            formal[a, b] = unit[b]
+
+
+@kernel
+def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
+    """Move what belongs to points with a weight to the front; their number, and the weighted square of ``left``.
+
+    ``columns`` (n, k + 17): derivatives by deflection, flattening, joint, lobes and light. ``of_used``: places of the
+    points, their rows (n, 16), residuals and weights.
+    """
+    at, used_rows, used_residual, used_weight = of_used
+    k, count, square, total = basis.shape[1], 0, 0.0, 0.0
+    for i in range(len(weight)):
+        if weight[i] > 0.0:
+            at[count] = i
+            for j in range(k):
+                columns[count, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[count, k], columns[count, k + 1] = rows[i, 2], rows[i, JOINT]
+            for j in range(SHAPES):
+                columns[count, k + 2 + j] = shape[i, j]
+            for j in range(COLUMNS):
+                used_rows[count, j] = rows[i, j]
+            used_residual[count], used_weight[count] = residual[i], weight[i]
+            square += weight[i] * left[i] * left[i]
+            total += weight[i]
+            count += 1
+    return count, square / total if total > 0.0 else 0.0

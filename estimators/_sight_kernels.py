@@ -146,9 +146,10 @@ def limb_points(circles, ring, flat, eye, clocks, points):
         reach = math.sqrt(a * a + b * b)
         if reach <= minor:
             return False
-        v = math.atan2(b, a) + math.acos(-minor / reach)
-        r = radius + minor * math.cos(v)
-        points[i, 0], points[i, 1], points[i, 2] = -(station + minor * math.sin(v)), r * oy, r * oz
+        # the eye seen from the circle's middle, turned by the angle whose cosine is -minor / reach
+        away, turned = -minor / reach, math.sqrt(reach * reach - minor * minor) / reach
+        r = radius + minor * (a * away - b * turned) / reach
+        points[i, 0], points[i, 1], points[i, 2] = -(station + minor * (b * away + a * turned) / reach), r * oy, r * oz
     return True
 
 

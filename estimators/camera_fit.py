@@ -131,7 +131,7 @@ class OrientedCamera(FrameModel):
             Where to start, e.g. the answer of the frame before.
         """
         frame = unedited(picture)
-        fault = fault_of_frame(frame.image, self.view.camera.size_px) or self._fault_of_breaks(frame)
+        fault = fault_of_frame(frame.kept, self.view.camera.size_px) or self._fault_of_breaks(frame)
         if fault:
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
@@ -172,7 +172,7 @@ class OrientedCamera(FrameModel):
 
         What is hidden, as a line of text, may be as wide.
         """
-        for row in breaks_across(frame.image):
+        for row in breaks_across(frame.kept):
             hidden = 0.0 if frame.hidden is None else float(frame.hidden[row : row + 2].mean())
             if hidden < _HIDDEN_BREAK and not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
                 words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
@@ -220,14 +220,14 @@ class OrientedCamera(FrameModel):
         """Share of edge points that agree on a second edge; a frame that shows one is refused, by `estimators.edge`."""
         rows = self.view.mismatch(horizon, self.view.edge(deformation))[1]
         seen = np.asarray(np.isfinite(rows).all(axis=1))
-        share, fault = second_edge(frame.smoothed, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
+        share, fault = second_edge(frame.kept, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
         if fault:
             raise NoFitError(fault)
         return share
 
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
         """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""
-        steepness = steepness_of(frame.smoothed, horizon)
+        steepness = steepness_of(frame.kept, horizon)
         # no comparison with NaN is true: of too few points nothing is said
         if min(steepness, self.steepness) < _AS_SHARP * max(steepness, self.steepness):
             raise NoFitError(

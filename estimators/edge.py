@@ -31,7 +31,9 @@ Assumed there: the two are apart by more than an edge's blur, and the weaker one
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -63,7 +65,7 @@ _BLOCK_PX, _BLOCK_STEP_PX = (16, 32), 4
 _COMBED, _OF_NOISE = 1.5, 4.0
 _MOST_COMBED = 0.015  # 0.3 % is the most in 408 sound frames; fields a second apart have 21 % (median of 374)
 # breaks across a picture, grey levels over twice the rows beside: in 408 sound frames 2.4 at the most, if rolled 6
-_BREAK_STEP_PX, _BREAK_MOST, _BREAK_BESIDE, _BREAK_OVER = 4, 16.0, 5, 3.5
+_BREAK_MOST, _BREAK_BESIDE, _BREAK_OVER = 16, 5, 3.5
 _SMOOTHING = cv2.getGaussianKernel(7, _SMOOTHING_PX, cv2.CV_32F)
 _NEAREST_PX, _FARTHEST_PX = 2.0, 24.0  # nearer is one edge, blurred; farther inside is the next torus
 _LEAST_STEP, _OF_SCATTER = 0.05, 3.0  # of the first edge's step; of the scatter of what is no step
@@ -156,8 +158,10 @@ def no_horizon(reason: Fault) -> HorizonLine:
     return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
 
 
-def fault_of_frame(image: Image, size_px: tuple[int, int]) -> Fault:
+def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Fault:
     """Why a frame cannot be used, before any edge is searched: size, darkness, saturation; empty when it can."""
+    kept = kept_picture(picture)
+    image = kept.image
     if image.size == 0:
         return Fault("cannot be decoded", "frame-undecodable")
     if image.ndim != 2 or image.dtype != np.uint8:
@@ -165,27 +169,20 @@ def fault_of_frame(image: Image, size_px: tuple[int, int]) -> Fault:
     if image.shape != (size_px[1], size_px[0]):
         size = f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
         return Fault(size, "frame-size")
-    count = np.empty(256, dtype=np.int64)
-    _edge_kernels.grey_histogram(image, 8, 4, count)
-    below = np.cumsum(count)
-    low, high = (float(np.searchsorted(below, share * below[-1], side="right")) for share in (0.05, 0.95))
+    low, high, saturated = _edge_kernels.grey_levels(image)
     if high < 2.0 * _LEAST_CONTRAST:
-        return Fault(f"too dark: 95 % of the pixels are no brighter than grey level {high:.0f} of 255", "frame-dark")
-    _edge_kernels.grey_histogram(image, 4, 4, count)
-    if low > 250.0 or count[254:].sum() > 0.5 * count.sum():
+        return Fault(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-dark")
+    if low > 250 or saturated > 0.5:
         return Fault("saturated: more than half of the pixels are at full scale", "frame-saturated")
-    return _fault_of_fields(image)
+    return _fault_of_fields(*kept.differences[:2])
 
 
-def _fault_of_fields(image: Image) -> Fault:
+def _fault_of_fields(one: FloatArray, two: FloatArray) -> Fault:
     """Whether every other row is of another moment: then rows next to each other differ more than every other one.
 
     In a picture of one moment the difference grows with the distance of the rows, and noise is in both alike. Fields
     whose edges lie less than a pixel or two apart pass: their mean is the edge at the mean of their times.
     """
-    shape = (image.shape[0] - 2) // _BLOCK_PX[0], image.shape[1] // _BLOCK_PX[1]
-    one, two = np.empty(shape), np.empty(shape)
-    _edge_kernels.row_differences(image, *_BLOCK_PX, _BLOCK_STEP_PX, one, two)
     differ = (one > _COMBED * two) & (one > _LEAST_CONTRAST**2)
     if np.count_nonzero(differ) <= _MOST_COMBED * one.size:
         return NO_FAULT
@@ -198,27 +195,23 @@ def _fault_of_fields(image: Image) -> Fault:
     return NO_FAULT
 
 
-def breaks_across(image: Image) -> NDArray[np.intp]:
+def breaks_across(image: Image | KeptPicture) -> NDArray[np.intp]:
     """Rows after which the picture breaks across most of its width: a border, or where a rolled picture begins anew.
 
     The shell's edges are curved: no row has a large share of one.
     """
-    steps = np.empty(len(image) - 1)
-    _edge_kernels.row_steps(image, _BREAK_STEP_PX, _BREAK_MOST, steps)
-    rows = np.flatnonzero(steps > _BREAK_OVER)
-    # the picture's ends are mirrored
-    around = np.abs(rows[:, None] + np.arange(-_BREAK_BESIDE, _BREAK_BESIDE + 1))
-    last = len(steps) - 1
-    beside = steps[np.where(around > last, 2 * last - around, around)]
-    return rows[steps[rows] > 2.0 * np.median(beside, axis=1) + _BREAK_OVER]
+    steps = kept_picture(image).differences[2]
+    found = np.empty(len(steps), dtype=np.bool_)
+    _edge_kernels.breaks(steps, _BREAK_BESIDE, _BREAK_OVER, found)
+    return np.flatnonzero(found)
 
 
-def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
+def find_horizon(image: Image | KeptPicture, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
     """Find the shell's upper edge.
 
     Parameters
     ----------
-    image : (h, w) uint8
+    image : (h, w) uint8, or `KeptPicture`
     lines : ScanLines
         Where to search.
     size_px : (2,) int
@@ -230,6 +223,7 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
         Refused with a reason when the frame is black, saturated, of another size, or fewer than 40 % of the lines
         cross a clear edge.
     """
+    image = kept_picture(image)
     fault = fault_of_frame(image, size_px)
     if fault:
         return no_horizon(fault)
@@ -244,7 +238,7 @@ def find_horizon(image: Image, lines: ScanLines, size_px: tuple[int, int]) -> Ho
     )
 
 
-def _lasting_rises(image: Image | Smoothed, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
+def _lasting_rises(image: Image | KeptPicture, lines: ScanLines) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Place along each line, px inwards from its origin, its sd without floor, whether there is one."""
     n = len(lines.origin_px)
     grey, inside = sampled(image, lines, round((lines.outer_px + lines.inner_px) / STEP_PX))
@@ -261,12 +255,12 @@ def _lasting_rises(image: Image | Smoothed, lines: ScanLines) -> tuple[FloatArra
     return STEP_PX * place - lines.outer_px, sd, good
 
 
-def steps_near(image: Image | Smoothed, lines: ScanLines) -> HorizonLine:
+def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
     """Find the edge where it is expected within a few pixels, darker or brighter than what lies behind it.
 
     Parameters
     ----------
-    image : (h, w) uint8, or `Smoothed`
+    image : (h, w) uint8, or `KeptPicture`
     lines : ScanLines
         With origins where the edge is expected; their lengths are not used.
     """
@@ -319,8 +313,8 @@ def middle_of(values: FloatArray) -> float:
     return float(sorted_in[half] if len(flat) % 2 else 0.5 * (sorted_in[:half].max() + sorted_in[half]))
 
 
-class Smoothed:
-    """A picture whose smoothed grey levels are kept, band by band, for those who look at it again.
+class KeptPicture:
+    """A picture, and what was made of it, for those who look at it again: how rows differ, smoothed grey levels.
 
     Parameters
     ----------
@@ -329,34 +323,49 @@ class Smoothed:
 
     def __init__(self, image: Image) -> None:
         self.image = image
-        self._low, self._high = np.zeros(2, dtype=int), np.zeros(2, dtype=int)
+        self._span = (0, 0, 0, 0)
         self._kept: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 
-    def band(self, low: NDArray[np.intp], high: NDArray[np.intp]) -> tuple[NDArray[np.float32], FloatArray]:
-        """Smoothed levels from the pixel ``low`` (2,) up to ``high``, or of more, and which pixel comes first."""
-        if np.any(low < self._low) or np.any(high > self._high):
+    @cached_property
+    def differences(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How rows differ; see `_edge_kernels.row_differences`."""
+        h, w = self.image.shape
+        shape = (h - 2) // _BLOCK_PX[0], w // _BLOCK_PX[1]
+        one, two, steps = np.empty(shape), np.empty(shape), np.empty(h - 1)
+        _edge_kernels.row_differences(self.image, *_BLOCK_PX, _BLOCK_STEP_PX, _BREAK_MOST, one, two, steps)
+        return one, two, steps
+
+    def band(self, span: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], FloatArray]:
+        """Smoothed levels from the pixel ``span[:2]`` up to ``span[2:]``, or of more, and which pixel comes first."""
+        left, top, right, bottom = self._span
+        if span[0] < left or span[1] < top or span[2] > right or span[3] > bottom:
             h, w = self.image.shape
-            self._low, self._high = np.maximum(low - _MORE_PX, 0), np.minimum(high + _MORE_PX, [w, h])
-            band = self.image[self._low[1] : self._high[1], self._low[0] : self._high[0]]
+            left, top = max(span[0] - _MORE_PX, 0), max(span[1] - _MORE_PX, 0)
+            right, bottom = min(span[2] + _MORE_PX, w), min(span[3] + _MORE_PX, h)
+            self._span = (left, top, right, bottom)
+            band = self.image[top:bottom, left:right]
             self._kept = np.asarray(cv2.sepFilter2D(band, cv2.CV_32F, _SMOOTHING, _SMOOTHING))
-        return self._kept, self._low.astype(float)
+        return self._kept, np.array([left, top], dtype=float)
 
 
-def smoothed(image: Image | Smoothed) -> Smoothed:
-    """Return a picture whose smoothed grey levels are kept."""
-    return image if isinstance(image, Smoothed) else Smoothed(image)
+def kept_picture(image: Image | KeptPicture) -> KeptPicture:
+    """Return a picture with what was made of it."""
+    return image if isinstance(image, KeptPicture) else KeptPicture(image)
 
 
-def sampled(image: Image | Smoothed, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
-    """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
-    picture = smoothed(image)
+def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
+    """KeptPicture grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
+    picture = kept_picture(image)
     h, w = picture.image.shape
-    outer, inner = lines.outer_px * lines.inward_px, lines.inner_px * lines.inward_px
-    ends = np.concatenate([lines.origin_px - outer, lines.origin_px + inner])
+    first, last = np.empty(2), np.empty(2)
+    _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, first, last)
     # only the band that the lines cross is smoothed
-    low = np.clip(np.floor(ends.min(axis=0)).astype(int) - 4, 0, [w - 4, h - 4])
-    high = np.clip(np.ceil(ends.max(axis=0)).astype(int) + 5, low + 4, [w, h])
-    smooth, corner = picture.band(low, high)
+    left, top = (min(max(math.floor(x) - 4, 0), most - 4) for x, most in zip(first.tolist(), (w, h), strict=True))
+    right, bottom = (
+        min(max(math.ceil(x) + 5, least + 4), most)
+        for x, least, most in zip(last.tolist(), (left, top), (w, h), strict=True)
+    )
+    smooth, corner = picture.band((left, top, right, bottom))
     n = len(lines.origin_px)
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
     _edge_kernels.sample_lines(
@@ -385,7 +394,7 @@ NEAR_PLACES: FloatArray = np.linspace(-4.75, 4.75, 39)
 NEAR_BASES = _edge_bases(NEAR_PLACES, NEAR_ALONG)
 
 
-def steepness_of(image: Image | Smoothed, horizon: HorizonLine) -> float:
+def steepness_of(image: Image | KeptPicture, horizon: HorizonLine) -> float:
     """How sharp is the edge: the grey levels' rise over its middle pixel, as a share of that over 4 px.
 
     Of all points together, so that noise has little part in it: a third of a sharp step after the smoothing, a quarter
@@ -393,7 +402,7 @@ def steepness_of(image: Image | Smoothed, horizon: HorizonLine) -> float:
 
     Parameters
     ----------
-    image : (h, w) uint8, or `Smoothed`
+    image : (h, w) uint8, or `KeptPicture`
     horizon : HorizonLine
     """
     if len(horizon.points_px) < _LEAST_POINTS:
@@ -409,13 +418,13 @@ def steepness_of(image: Image | Smoothed, horizon: HorizonLine) -> float:
 
 
 def second_edge(
-    image: Image | Smoothed, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
+    image: Image | KeptPicture, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
 ) -> tuple[float, Fault]:
     """Share of edge points that agree on a second edge, zero where it is usual; why it is two pictures, if it is.
 
     Parameters
     ----------
-    image : (h, w) uint8, or `Smoothed`
+    image : (h, w) uint8, or `KeptPicture`
     horizon : HorizonLine
         Edge points, ``n`` in all.
     by_turn : (n, 2) float

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.edge import HorizonLine, ScanLines, Smoothed, find_horizon, steps_near
+from estimators.edge import HorizonLine, KeptPicture, ScanLines, find_horizon, steps_near
 from estimators.features import Features
 from estimators.texture import surface_seen
 from estimators.virtual_camera import VirtualCamera
@@ -97,9 +97,9 @@ class EditedFrame:
     features_px: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
-    def smoothed(self) -> Smoothed:
-        """The picture with what was smoothed of it."""
-        return Smoothed(self.image)
+    def kept(self) -> KeptPicture:
+        """The picture with what was made of it."""
+        return KeptPicture(self.image)
 
     @property
     def has_marked_edge(self) -> bool:
@@ -108,11 +108,11 @@ class EditedFrame:
 
     def far_edge(self, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
         """Edge searched from far; see `find_horizon`."""
-        return self._edge(find_horizon(self.image, lines, size_px), lines)
+        return self._edge(find_horizon(self.kept, lines, size_px), lines)
 
     def near_edge(self, lines: ScanLines) -> HorizonLine:
         """Edge within a few pixels of where it is expected; see `steps_near`."""
-        return self._edge(steps_near(self.smoothed, lines), lines)
+        return self._edge(steps_near(self.kept, lines), lines)
 
     def _edge(self, found: HorizonLine, lines: ScanLines) -> HorizonLine:
         if self.has_marked_edge:

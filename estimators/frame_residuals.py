@@ -94,13 +94,12 @@ def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: Float
 
 def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
     """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides, as the shell stands in it."""
-    half = 0.5 * np.array(view.camera.size_px)
-    y, z = view.camera.position_body_m[1:]
-    # towards smaller clocking angles, to the right of an upright picture
-    along = view.camera.dcm_cam_body[:2, 1:] @ np.array([-z, y])
-    along /= np.hypot(*along)
-    side = (horizon.points_px - half) @ along / (np.abs(along) @ half)
-    return np.column_stack([np.ones_like(side), side, 1.5 * side**2 - 0.5])
+    along, across, half = view.across_picture
+    u, v = horizon.points_px.T
+    side = ((u - half[0]) * along + (v - half[1]) * across) / (abs(along) * half[0] + abs(across) * half[1])
+    out = np.empty((len(side), 3))
+    out[:, 0], out[:, 1], out[:, 2] = 1.0, side, 1.5 * side**2 - 0.5
+    return out
 
 
 def lobe_columns(rows: FloatArray, away_m: FloatArray, clocks_rad: FloatArray) -> FloatArray:

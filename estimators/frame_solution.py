@@ -42,7 +42,7 @@ from estimators.features import Features, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS
 from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns
-from estimators.virtual_camera import CAMERA, DEFLECTION, FLATTENING, HELD, VirtualCamera
+from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
@@ -367,34 +367,55 @@ class FrameModel:
     ) -> Solution:  # fmt: skip
         """Fit as `_fit_points`, with its covariance; `NoFitError` where the residuals are too large."""
         k = basis.shape[1]
-        mean, sd = prior = prior or self._shape_prior(k)
+        _, sd = prior = prior or self._shape_prior(k)
         found = self._fit_points(horizon, place, deformation, basis, prior)
-        residual, rows, shape, weight = found.residual_px, found.rows, found.shape, found.weight
-        used = weight > 0.0
+        n, width = len(found.weight), k + len(sd)
+        columns, at, rows = np.empty((n, width)), np.empty(n, dtype=np.intp), np.empty((n, found.rows.shape[1]))
+        residual, weight = np.empty(n), np.empty(n)
+        count, square = _fit_kernels.used_points(
+            np.ascontiguousarray(basis), found.rows, found.shape, found.residual_px, found.left_px, found.weight,
+            columns, (at, rows, residual, weight),
+        )  # fmt: skip
         least = min(least_points(horizon), LEAST_FEATURES)
-        if used.sum() < least:
+        if count < least:
             raise NoFitError(
-                f"{used.sum()} edge points and features agree with one deflection where {least} are needed",
+                f"{count} edge points and features agree with one deflection where {least} are needed",
                 "edge-points-too-few",
             )
-        residual, rows, shape, weight = residual[used], rows[used], shape[used], weight[used]
-        rms = float(np.sqrt(np.average(found.left_px[used] ** 2, weights=weight)))
+        rms = float(np.sqrt(square))
         if rms > worst_rms_px:
             raise NoFitError(
                 f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed", "edge-not-shell"
             )
-        design = np.concatenate([rows[:, DEFLECTION] @ basis, rows[:, [FLATTENING, JOINT]], shape], axis=1)
-        weighted = design.T * weight
-        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(k), sd**-2.0])))
-        before = self.benchmark_residuals.rows[found.benchmark_at[used]]
-        edge_count = int(used[: found.edge_points].sum())
+        columns, at, rows, residual, weight = (
+            columns[:count],
+            at[:count],
+            rows[:count],
+            residual[:count],
+            weight[:count],
+        )
+        formal, step = np.empty((width, width)), np.empty(width)
+        _fit_kernels.solved(columns, residual, weight, prior, float(deformation[2]), formal, step)
+        before = self.benchmark_residuals.rows[found.benchmark_at[at]]
+        edge_count = int(np.searchsorted(at, found.edge_points))
         # the flattening's value was carried from step to step, the others are counted from zero in each
-        pull = np.concatenate([np.zeros(k), (mean - np.eye(len(sd))[0] * deformation[2]) / sd**2])
-        shape_found = (formal @ (weighted @ residual + pull))[k:]
+        shape_found = step[k:]
         shape_found[0] += deformation[2]
-        features = np.zeros(0, dtype=np.intp) if place is None else found_rows(place)[used[found.edge_points :]]
+        features = (
+            np.zeros(0, dtype=np.intp) if place is None else found_rows(place)[at[edge_count:] - found.edge_points]
+        )
         return Solution(
-            formal @ weighted, formal, shape_found, design, rows, before, edge_count, rms, residual, weight, features
+            (formal @ columns.T) * weight,
+            formal,
+            shape_found,
+            columns,
+            rows,
+            before,
+            edge_count,
+            rms,
+            residual,
+            weight,
+            features,
         )
 
     @cached_property
@@ -405,17 +426,14 @@ class FrameModel:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
         edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
         design, weight = both.columns[edge], both.weight[edge]
-        weighted = design.T * weight
-        formal = np.linalg.inv(weighted @ design + np.diag(np.concatenate([np.zeros(2), sd**-2.0])))
-        right = weighted @ both.residual_px[edge]
-        right[2:] += (mean - np.eye(len(sd))[0] * flattening_rad) / sd**2
-        step = formal @ right
+        formal, step = np.empty_like(both.formal), np.empty(len(both.formal))
+        _fit_kernels.solved(design, both.residual_px[edge], weight, (mean, sd), flattening_rad, formal, step)
         # features that contradict the edge leave it residuals that are none of its scatter
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
         alone = replace(
-            both, gain=formal @ weighted, formal=np.asarray(min(scatter, 1.0) * formal), rows=both.rows[edge],
-            before=both.before[edge], feature_rows=both.feature_rows[:0],
+            both, gain=(formal @ design.T) * weight, formal=np.asarray(min(scatter, 1.0) * formal),
+            rows=both.rows[edge], before=both.before[edge], feature_rows=both.feature_rows[:0],
         )  # fmt: skip
         return step[:2], alone
 
@@ -466,4 +484,6 @@ class FrameModel:
         # of the best answers, the better one's error has no part in the difference
         value, axes = np.linalg.eigh((edge.formal - both.formal)[:2, :2])
         covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
-        return float(difference @ np.linalg.solve(covariance, difference))
+        (a, b), (c, d) = covariance.tolist()
+        y, z = difference.tolist()
+        return (d * y * y - (b + c) * y * z + a * z * z) / (a * d - b * c)

@@ -115,6 +115,15 @@ class VirtualCamera:
         return self.clocks_rad, self._circles, self._ring, self.width_m, self.joint_station_m
 
     @cached_property
+    def across_picture(self) -> tuple[float, float, tuple[float, float]]:
+        """Unit vector in the picture towards smaller clocking angles, to the right if upright; half its size, px."""
+        y, z = self.camera.position_body_m[1:]
+        along = self.camera.dcm_cam_body[:2, 1:] @ np.array([-z, y])
+        along /= np.hypot(*along)
+        width, height = self.camera.size_px
+        return float(along[0]), float(along[1]), (0.5 * width, 0.5 * height)
+
+    @cached_property
     def _circles(self) -> FloatArray:
         """Station, radius and minor radius, m, whose limb is the edge at each clocking angle (n, 3)."""
         return edge_circles(self.geometry, self.camera.position_body_m, self.clocks_rad)

@@ -24,7 +24,7 @@ from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
-from postflight.filming import NO_VIDEO, by_camera
+from postflight.filming import NO_VIDEO, CameraAnswer, by_camera
 from postflight.flight import Flight, read_flight
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
@@ -250,7 +250,12 @@ def _answered(
     stages.end("trajectory")
     second.draw_trajectory(bet, figures)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-    answers = estimate(bet, wanted, step(0.7, 1.0), second.camera)
+
+    def camera() -> CameraAnswer | None:
+        _ = bet.table  # while the second process has no answer yet
+        return second.camera()
+
+    answers = estimate(bet, wanted, step(0.7, 1.0), camera)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
