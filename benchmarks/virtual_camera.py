@@ -4,9 +4,9 @@
 
 On FLIGHT (a folder of `postflight simulate`) also the answer of two cameras, which show the same film, against that of
 one. Peers: scipy's least squares over OpenCV's fisheye projection, given the edge points and marks that ours must find
-first, with five unknowns (ours has nineteen), both from the answer and from an undeflected shell; the same rasteriser in
-plain C++ (needs g++); trimesh with embreex (one ray a pixel), and open3d where it is installed. Jobs take turns; times
-are minima, of the wall and of the processor with all threads.
+first, with five unknowns (ours has nineteen), both from the answer and from an undeflected shell; the same rasteriser
+in plain C++ (needs g++); trimesh with embreex (one ray a pixel), and open3d where it is installed. Jobs take turns;
+times are minima, of the wall and of the processor with all threads.
 """
 
 from __future__ import annotations

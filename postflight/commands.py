@@ -245,7 +245,7 @@ def _answered(
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
     if "camera" in methods and len(flight.telemetry.films) == 1:
-        second.read_film(flight)
+        second.read_film(flight, "fused" in methods)
     bet = reconstruct(flight, None, step(0.05, 0.7))
     stages.end("trajectory")
     second.draw_trajectory(bet, figures)
@@ -255,7 +255,7 @@ def _answered(
         _ = bet.table  # while the second process has no answer yet
         return second.camera()
 
-    answers = estimate(bet, wanted, step(0.7, 1.0), camera)
+    answers = estimate(bet, wanted, step(0.7, 1.0), camera, second.time_bias)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
         answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)

@@ -17,7 +17,7 @@ from flightmodel.tabular import Tabular
 from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import Flight
 from postflight.flown_coefficients import AeroIncrements, increments_of
-from postflight.fusing import FusedAnswer, fuse_flight
+from postflight.fusing import CameraTimeBias, FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
 from recon.consistency import ConsistencyCheck
@@ -239,11 +239,13 @@ def estimate(
     methods: tuple[str, ...],
     progress: Progress | None = None,
     seen: Callable[[], CameraAnswer | None] = lambda: None,
+    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
     A `Flight` without a trajectory has an answer of the camera alone. What ``seen`` returns is taken for the camera's
-    answer, and waited for while other methods run; without it the film is read.
+    answer, and waited for while other methods run; without it the film is read. ``tested``: the same of the test of the
+    camera's time bias.
     """
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
@@ -266,7 +268,7 @@ def estimate(
                 used = filmed is not None and "camera" in answers.histories
                 camera = filmed.plain if filmed is not None and used else _camera_for_fusion(flight, answers.refused)
                 time_bias_s = min((film.time_bias_sd_s for film in flight.telemetry.films.values()), default=0.0)
-                fused = fuse_flight(bet.required_loads(), camera, time_bias_s)
+                fused = fuse_flight(bet.required_loads(), camera, time_bias_s, tested if used else lambda: None)
                 history = fused.fused.history
         except GateError as fault:
             answers.refused[method] = Fault(str(fault), fault.codes[0])

@@ -14,6 +14,7 @@ each method, or a posterior in which the likeliest fault's inputs are as good as
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -176,6 +177,7 @@ def fuse_flight(
     loads: FlightLoads,
     camera: DeflectionHistory | None,
     camera_time_bias_sd_s: float = 0.0,
+    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
 ) -> FusedAnswer:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
 
@@ -207,13 +209,18 @@ def fuse_flight(
     sources = _Sources(loads, camera)
     observable = camera is not None and sources.shows_time_bias()
     bias_sd_s = camera_time_bias_sd_s if observable else 0.0
-    bias = _tested_time_bias(sources) if observable and bias_sd_s == 0.0 else None
+    is_tested = observable and bias_sd_s == 0.0
+
+    def bias() -> CameraTimeBias | None:
+        known = tested() if is_tested else (None,)
+        return _tested_time_bias(sources) if known is None else known[0]
+
     try:
         answer = sources.answer(sources.names, bias_sd_s)
     except DivergenceError as fault:
         resolved = _without_each(sources, bias_sd_s)
         if resolved is None:
-            raise _explained(fault, sources, bias_sd_s, bias) from None
+            raise _explained(fault, sources, bias_sd_s, bias()) from None
         answer = replace(resolved, agreement=sources.tested(fault, bias_sd_s))
     else:
         if not all(pair.passed for pair in answer.agreement.pairs):
@@ -222,7 +229,13 @@ def fuse_flight(
             answer = _with_faults_freed(sources, answer, bias_sd_s)
     seen = tuple(n for n in sources.names if n != "camera" or answer.left_out != "camera")
     answer = replace(answer, reader=sources.loads_reader(seen, bias_sd_s))
-    return answer if answer.camera_time_bias is not None else replace(answer, camera_time_bias=bias)
+    return answer if answer.camera_time_bias is not None else replace(answer, camera_time_bias=bias())
+
+
+def time_bias_if_free(loads: FlightLoads, camera: DeflectionHistory) -> CameraTimeBias | None:
+    """Camera time bias as `fuse_flight` tests one that is stated as zero; None where that is not observable."""
+    sources = _Sources(loads, camera)
+    return _tested_time_bias(sources) if sources.shows_time_bias() else None
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # the process decides first how pandas is loaded
     from postflight.filming import CameraAnswer
     from postflight.flight import Flight
     from postflight.flown_coefficients import AeroIncrements
+    from postflight.fusing import CameraTimeBias
     from postflight.reconstruction import Reconstruction
     from postflight.studies.preflight import Bounds
 
@@ -61,7 +62,7 @@ class SecondProcess:
         self._asked: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         self._flight: Reconstruction | None = None
         self._drawing: list[tuple[_Part, tuple[Any, ...]]] = []
-        self._reading = False
+        self._reading, self._fuses, self._tests = False, False, False
 
     def __enter__(self) -> SecondProcess:
         """Start it."""
@@ -85,9 +86,12 @@ class SecondProcess:
         self._sender.shutdown(cancel_futures=True)
         self._here.close()
 
-    def read_film(self, flight: Flight) -> None:
-        """Let it read the film of a flight's one camera; with the trajectory it then has the camera's answer."""
-        self._reading = True
+    def read_film(self, flight: Flight, fuses: bool = False) -> None:
+        """Let it read the film of a flight's one camera; with the trajectory it then has the camera's answer.
+
+        For an answer that ``fuses`` it also tests the camera's time bias.
+        """
+        self._reading, self._fuses = True, fuses
         self._send(("film", (flight,)))
 
     def camera(self) -> CameraAnswer | None:
@@ -98,6 +102,18 @@ class SecondProcess:
             with contextlib.suppress(EOFError, OSError):
                 found = self._here.recv()
         return found
+
+    def time_bias(self) -> tuple[CameraTimeBias | None] | None:
+        """Camera time bias as tested, after `camera`; None where that was not asked for or could not be done."""
+        found: tuple[CameraTimeBias | None, _Warnings] | None = None
+        if self._tests:
+            self._tests = False
+            with contextlib.suppress(EOFError, OSError):
+                found = self._here.recv()
+        if found is None:
+            return None
+        _warn(found[1])
+        return (found[0],)
 
     def ask(self, work: Callable[..., Any], *arguments: Any) -> None:
         """Let it call a function, which is found by its module and name."""
@@ -121,6 +137,9 @@ class SecondProcess:
         self._send(("flight", (flight, figures)))
         if self._reading:
             self._send(("camera", ()))
+            self._tests = self._fuses
+            if self._tests:
+                self._send(("time bias", ()))
         self._draw("trajectory")
 
     def draw_deflections(self, answers: Deflections) -> None:
@@ -142,6 +161,7 @@ class SecondProcess:
             Where it could not write a file.
         """
         self.camera()
+        self.time_bias()
         for part, arguments in self._drawing:
             try:
                 found: _Warnings | OSError = self._here.recv()
@@ -226,6 +246,12 @@ def _camera(bet: Reconstruction | None, film: FilmFit | None) -> CameraAnswer | 
         return None
 
 
+def _time_bias(bet: Reconstruction, seen: CameraAnswer) -> CameraTimeBias | None:
+    from postflight.fusing import time_bias_if_free
+
+    return time_bias_if_free(bet.required_loads(), seen.plain)
+
+
 def _serve(connection: Connection, other_end: Connection | None, draws: bool) -> None:
     """Be ready, do what is asked in its order, and send back what came of it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C is for the process that started this one
@@ -237,6 +263,7 @@ def _serve(connection: Connection, other_end: Connection | None, draws: bool) ->
         return_large_arrays()
     film: FilmFit | None = None
     flight: Reconstruction | None = None
+    seen: CameraAnswer | None = None
     figures = Path()
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:
@@ -249,5 +276,10 @@ def _serve(connection: Connection, other_end: Connection | None, draws: bool) ->
                 flight, figures = arguments
             elif kind == "work":
                 connection.send(_answered(*arguments))
+            elif kind == "camera":
+                seen = _camera(flight, film)
+                connection.send(seen)
+            elif kind == "time bias":
+                connection.send(_answered(_time_bias, (flight, seen)))
             else:
-                connection.send(_camera(flight, film) if kind == "camera" else _drawn(kind, flight, figures, arguments))
+                connection.send(_drawn(kind, flight, figures, arguments))

@@ -20,7 +20,7 @@ from flightmodel import rotations
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
 from flightmodel.statistics import correlation
-from postflight.fusing import CameraTimeBias, fuse_flight
+from postflight.fusing import CameraTimeBias, fuse_flight, time_bias_if_free
 
 from .conftest import pulse_of
 
@@ -132,6 +132,11 @@ def test_a_time_bias_stated_as_zero_is_tested_but_not_applied():
     assert fuse_flight(loads, None).time_bias_summary() is None
     assert allowed.time_bias_summary()["applied"]
     assert not CameraTimeBias(0.01, 0.01, False).is_off
+    # tested elsewhere meanwhile it is the same, and what comes from there is taken
+    assert time_bias_if_free(loads, readings) == trusted.camera_time_bias
+    other = CameraTimeBias(0.5, 0.1, False)
+    assert fuse_flight(loads, readings, tested=lambda: (other,)).camera_time_bias == other
+    assert fuse_flight(loads, None, tested=lambda: (other,)).camera_time_bias is None
 
 
 def test_late_triads_are_set_right():

@@ -37,11 +37,12 @@ def drawn(done):
 def test_a_killed_process_costs_no_figure(monkeypatch):
     done = draw_here(monkeypatch)
     with second_process.SecondProcess(draws=True) as process:
-        process.read_film("flight")
+        process.read_film("flight", fuses=True)
         os.kill(process._process.pid, signal.SIGKILL)
         process._process.join()
         all_parts(process)
         assert process.camera() is None
+        assert process.time_bias() is None
         process.finish()
     assert drawn(done)
 
