@@ -50,7 +50,13 @@ from recon.atmosphere import (
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
-from recon.entry_density import density_by_drag, density_check, drag_jump_check, profile_as_flown
+from recon.entry_density import (
+    density_by_drag,
+    density_check,
+    drag_jump_check,
+    profile_as_flown,
+    temperature_check,
+)
 from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
@@ -288,7 +294,8 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     density, checks = None, tuple[ConsistencyCheck, ...]()
     if telemetry.drag is not None:
         density = density_by_drag(telemetry, solution.smoothed, solution.drag)
-        found = (each(density, stated, solution.settings.check_confidence) for each in (density_check, drag_jump_check))
+        tests, confidence = (density_check, temperature_check, drag_jump_check), solution.settings.check_confidence
+        found = (test(density, stated, confidence) for test in tests)
         checks = tuple(each for each in found if each is not None)
         profile = profile_as_flown(stated, density)
     air = airdata.air_data(solution.smoothed, profile, _arm(flight.vehicle))

@@ -28,6 +28,7 @@ J. Geophys. Res. 104 (1999) 8943.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -270,19 +271,80 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
         stated.at(height).density_sd,
         table["altitude_sd_m"] * np.interp(height, knots, per_m),
     )
-    rows = pd.DataFrame({"log_ratio": np.log(table["density_ratio"]), "sd": np.sqrt(sum(part**2 for part in parts))})
-    layers = rows.groupby(np.floor(height / _INDEPENDENT_M)).mean()
-    shift = (layers["log_ratio"] / layers["sd"]).to_numpy()
-    worst = int(np.argmax(np.abs(shift)))
-    below = _INDEPENDENT_M * layers.index[worst]
-    name = f"density at {below / 1e3:.0f} to {(below + _INDEPENDENT_M) / 1e3:.0f} km"
-    found = f"{name} is {np.exp(layers['log_ratio'].iloc[worst]):.2g} times the stated atmosphere's"
+    sd = np.sqrt(sum(part**2 for part in parts))
+    layer = _worst_layer(height, np.log(table["density_ratio"]).to_numpy(), np.asarray(sd), confidence)
+    found = f"density at {layer.between} is {np.exp(layer.mean):.2g} times the stated atmosphere's"
     return consistency_check(
-        "sounding-density", "sounding density", float(np.abs(shift[worst])), 0.0,
-        float(-ndtri(0.5 * (1.0 - confidence) / len(layers))), f"{found}, within what both may err", found,
+        "sounding-density", "sounding density", layer.away, 0.0, layer.most, f"{found}, within what both may err",
+        found,
         advice="the air differed, or mass, area or C_A of [drag], height or speed of the stated state, or the "
-        "accelerometer's unit is wrong", component=name,
+        "deceleration are in error", component=f"density at {layer.between}",
     )  # fmt: skip
+
+
+def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+    """Check the temperature by the weight of the air above against the stated one, by the errors of both.
+
+    It is of another kind than density: a factor of the drag is not in it, but a deceleration that is too small, or rows
+    that are missing with their time, leave the vehicle too fast, the air below too thin for what weighs on it, and so
+    too hot. C_A may err along the path by as much as in common.
+
+    Parameters
+    ----------
+    table : DataFrame
+        Of `density_by_drag`.
+    stated : AtmosphereProfile
+    confidence : float
+        Two-sided, of the check.
+
+    Returns
+    -------
+    ConsistencyCheck or None
+        None of an empty table.
+    """
+    if table.empty:
+        return None
+    height = table["altitude_m"].to_numpy()
+    flown = table["pressure_pa"] / (gas_constant(height, stated.planet) * table["density_kgpm3"])
+    of_density = table["density_sd_kgpm3"] / table["density_kgpm3"]
+    of_pressure = table["pressure_sd_pa"] / table["pressure_pa"]
+    own = np.sqrt(of_density**2 + of_pressure**2 - table["common_factor_sd"] ** 2)
+    usual = stated.at(height).temperature_k
+    sd = np.hypot(own * usual, stated.temperature_sd(height))
+    layer = _worst_layer(height, (flown - usual).to_numpy(), np.asarray(sd), confidence)
+    found = f"temperature by the drag at {layer.between} is {layer.mean:+.0f} K from the stated atmosphere's"
+    return consistency_check(
+        "sounding-temperature", "sounding temperature", layer.away, 0.0, layer.most,
+        f"{found}, within what both may err", found,
+        advice="scale or axis of the accelerometer, rows that are missing with their time, axes, angles and speed of "
+        "the stated state or C_A over Mach number are in error, or the air differed",
+        component=f"temperature at {layer.between}",
+    )  # fmt: skip
+
+
+class _Layer(NamedTuple):
+    """Layer in which a profile is farthest off: its mean, over its sd, most of that, and its heights in words."""
+
+    mean: float
+    away: float
+    most: float
+    between: str
+
+
+def _worst_layer(height_m: FloatArray, off: FloatArray, sd: FloatArray, confidence: float) -> _Layer:
+    """Layer farthest beyond its limit, of a profile's differences (n,) with their sd.
+
+    The surest layer is chosen before its value is seen, and has all the confidence; it is shared among the others.
+    """
+    rows = pd.DataFrame({"off": off, "sd": sd})
+    layers = rows.groupby(np.floor(height_m / _INDEPENDENT_M)).mean()
+    shift = np.abs(layers["off"] / layers["sd"]).to_numpy()
+    most = np.full(len(layers), -ndtri(0.5 * (1.0 - confidence) / len(layers)))
+    most[int(np.argmin(layers["sd"]))] = -ndtri(0.5 * (1.0 - confidence))
+    worst = int(np.argmax(shift / most))
+    below = _INDEPENDENT_M * layers.index[worst]
+    between = f"{below / 1e3:.0f} to {(below + _INDEPENDENT_M) / 1e3:.0f} km"
+    return _Layer(float(layers["off"].iloc[worst]), float(shift[worst]), float(most[worst]), between)
 
 
 def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:

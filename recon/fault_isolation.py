@@ -49,10 +49,14 @@ from recon.time_bias import ClockJump, Lag
 _CONFIDENCE = 0.999  # of each test: of some twenty a flight, one false alarm in fifty flights
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
 _ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # codes of checks about one tracker or sensor
-_AIR_CODES = ("sounding", "pre-flight-drag", "sounding-density", "sounding-wind", "pre-flight-ca", "force-residuals")
+_AIR_CODES = (
+    "sounding", "pre-flight-drag", "sounding-density", "sounding-temperature", "drag-jump", "sounding-wind",
+    "pre-flight-ca", "force-residuals",
+)  # fmt: skip
 _AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
 _ABOUT_BOTH = ("clock-lag", "triads-axes")
+_ABOUT_DECELERATION = ("reading-jump", "vacuum-reading")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
 
@@ -371,7 +375,7 @@ def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesi
 def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
     """What the failed checks and the comparison of trackers say."""
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in TRIADS]
-    inertial += [v for v in failed if v.code in _ABOUT_BOTH]
+    inertial += [v for v in failed if v.code in _ABOUT_BOTH + _ABOUT_DECELERATION]
     shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
     out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
     if any(is_about(v, s.source) for v in failed for s in left_out):

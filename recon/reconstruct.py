@@ -382,6 +382,8 @@ def reconstruct_once(
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
     checks += consistency.vacuum_checks(problem, run, settings.check_confidence)
+    trim_sd = telemetry.motion.trim_sd_rad
+    checks += consistency.reading_jump_checks(problem, run, trim_sd, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += [] if phase is None else [phase.check()]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)

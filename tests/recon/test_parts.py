@@ -14,7 +14,7 @@ from flightmodel.trajectory import Trajectory, difference
 from recon import reconstruct
 from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
-from recon.entry_density import _spread, drag_jump_check
+from recon.entry_density import _spread, drag_jump_check, temperature_check
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -364,3 +364,40 @@ def test_a_jump_of_the_density_by_drag_is_counted_in_what_the_air_may_change(fac
         assert drag_jump_check(table, climate, 0.999).value == pytest.approx(expected, rel=0.02)
     # nothing to compare in a second's rows
     assert drag_jump_check(table[:per_s], stated, 0.999) is None
+
+
+@pytest.mark.parametrize(("off_k", "layer"), [(0.0, None), (110.0, 2), (66.0, 4), (60.0, 2)])
+def test_a_temperature_by_the_drag_is_judged_by_both_errors_layer_by_layer(off_k, layer):
+    """The stated 200 K err by 12 K, the flown ones by 8 % of it or, in the surest layer of five, by 4 %."""
+    height = np.linspace(49.9e3, 0.0, 500)
+    own = np.where(height // 10e3 == 4, 0.04, 0.08)
+    common = 0.05
+    part = np.hypot(own / np.sqrt(2.0), np.sqrt(common**2 / 2.0))  # C_A's is counted once
+    temperature = 200.0 + off_k * (height // 10e3 == layer)
+    density = np.full(500, 1e-3)
+    table = pd.DataFrame(
+        {
+            "altitude_m": height,
+            "density_kgpm3": density,
+            "density_sd_kgpm3": density * part,
+            "pressure_pa": density * earth.MARS.gas_jpkgk * temperature,
+            "pressure_sd_pa": density * earth.MARS.gas_jpkgk * temperature * part,
+            "common_factor_sd": np.full(500, common),
+        }
+    )
+    stated = SimpleNamespace(
+        planet=earth.MARS,
+        at=lambda height_m: SimpleNamespace(temperature_k=np.full(len(height_m), 200.0)),
+        temperature_sd=lambda height_m: np.full(len(height_m), 12.0),
+    )
+    check = temperature_check(table, stated, 0.999)
+    if layer is None:
+        assert check.passed
+        return
+    share = 0.04 if layer == 4 else 0.08
+    assert check.value == pytest.approx(off_k / np.hypot(200.0 * share, 12.0), rel=1e-6)
+    # normal: 3.29 of the surest alone, 3.72 of one of five
+    assert check.high == pytest.approx(3.29 if layer == 4 else 3.72, abs=0.005)
+    assert check.passed == (off_k == 60.0)
+    assert check.component == f"temperature at {10 * layer} to {10 * layer + 10} km"
+    assert temperature_check(table[:0], stated, 0.999) is None

@@ -271,6 +271,35 @@ def test_a_drag_that_jumps_is_red(tmp_path, times, passed):
         assert before <= 115.0 < after < 122.0
 
 
+@pytest.mark.parametrize("off_deg", [0.0, 30.0])
+def test_a_deceleration_that_is_too_small_leaves_the_air_below_too_hot(tmp_path, off_deg):
+    """An axis 30 deg off: speed 61 sd wrong, density 400, every check green."""
+    truth = mars_entry.fly(916)
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: rows * [1.0, np.cos(np.deg2rad(off_deg))]))
+    (check,) = (one for one in bet.consistency_checks if one.code == "sounding-temperature")
+    assert check.passed == (off_deg == 0.0)
+    assert check.passed or check.symptom.endswith("K from the stated atmosphere's")
+    assert bool(bet.suspects) == (not check.passed)
+
+
+@pytest.mark.parametrize("missing_s", [0.0, 3.0])
+def test_rows_that_are_missing_and_whose_times_were_closed_up_are_red(tmp_path, missing_s):
+    """Six seconds before the peak; the speed was 20 sd wrong, every check green."""
+    truth = mars_entry.fly(917, to_s=120.0)
+    cut_s = truth.time_s[np.argmax(truth.axial_mps2)] - 6.0
+
+    def closed_up(rows):
+        there = (rows[:, 0] < cut_s) | (rows[:, 0] >= cut_s + missing_s)
+        return np.column_stack([rows[: there.sum(), 0], rows[there, 1]])
+
+    bet = pf.reconstruct(spoilt(truth, tmp_path, closed_up))
+    (check,) = (one for one in bet.consistency_checks if one.code == "reading-jump")
+    assert check.passed == (missing_s == 0.0)
+    if missing_s:
+        before, after = numbers_in(check.component)
+        assert cut_s - 0.2 < before < after < cut_s + 0.2
+
+
 @pytest.mark.parametrize("late_s", [-5.0, 5.0])
 def test_a_clock_that_is_late_by_what_is_stated_is_in_the_sd_of_place(tmp_path, late_s):
     """Nothing in the data shows it: 5 s late, places were up to 16 sd wrong with every check green."""
