@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import Fault, FloatArray
+from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import Angle, Elevation, KeyFaults, Latitude, Longitude, Section, Time
 from flightmodel.gate import Gate
 from flightmodel.tables import Source
@@ -30,6 +30,7 @@ Axes = Literal["fixed", "inertial", "j2000"]
 Triple = tuple[float, float, float]
 Size = Annotated[float, Field(gt=0.0, le=1e8)]
 Percent = Annotated[float, Field(ge=0.0, le=300.0)]
+_LOWEST_M, _HIGHEST_M = -1e4, 1e6  # Hellas; beyond the atmospheres' tables
 _CARTESIAN = ("position_m", "velocity_mps")
 _SPHERICAL = ("latitude_deg", "longitude_deg", "speed_mps", "flight_path_deg", "azimuth_deg")
 
@@ -117,12 +118,20 @@ class StateEntry(Section):
                 for key, p in zip(self._values, parts, strict=True)
             ]
             covariance = np.diag(np.concatenate(sd) ** 2)
+        state = self._fixed(stated, t0_utc, planet)
+        height = float(earth.geodetic_from_ecef(state[:3], planet)[2])
+        if not _LOWEST_M <= height <= _HIGHEST_M:
+            name = earth.name_of(planet).capitalize()
+            words = (
+                f"its height above {name}'s ellipsoid is {height / 1000.0:.0f} km: radius_m is from {name}'s centre, "
+                "altitude_m from the ellipsoid, in metres; of an altitude above a sphere state radius_m, the sum"
+            )
+            raise GateError(words, "state-height")
         step = 0.1 * np.sqrt(np.diagonal(covariance))
         moved = [
             self._fixed(stated + h, t0_utc, planet) - self._fixed(stated - h, t0_utc, planet) for h in np.diag(step)
         ]
         jacobian = np.array(moved).T / (2.0 * step)
-        state = self._fixed(stated, t0_utc, planet)
         late = self.t_sd_s * _in_free_fall(state, planet)
         whole = jacobian @ covariance @ jacobian.T + np.outer(late, late)
         return StatePrior(self.t_s, state[:3], state[3:], 0.5 * (whole + whole.T))

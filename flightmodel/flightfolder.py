@@ -69,6 +69,7 @@ from flightmodel.sensor_tables import (
     read_sounding,
     read_sun,
     read_triad,
+    refuse_misread_entry,
     with_least_count,
 )
 from flightmodel.tables import GNSS_SD, Source, Spans
@@ -457,6 +458,8 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     if spec.measures_deceleration and (alone := triads.get("accelerometer")) is not None:
         triads["accelerometer"], counted = with_least_count(alone)
         gate.findings.extend(counted)
+        if state is not None and not spec.motion.powered_s:
+            refuse_misread_entry(gate, alone, state)
     idle = spec.motion.model == "ballistic" and not spec.measures_deceleration
     if idle and triads.get("accelerometer") and triads.get("rates"):
         words = (

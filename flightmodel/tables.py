@@ -216,7 +216,7 @@ class TimeEntry(Section):
     columns: tuple[str, str, str] | None = None
     format: Literal["seconds", "utc", "irig_doy", "utc_hms"] = "seconds"
     unit: Literal["s", "ms", "us", "min"] = "s"
-    offset_s: Time = 0.0
+    offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0  # a spacecraft's clock counts from 1980 or 2000
     repeats: Literal["refuse", "first"] = "refuse"
 
     @model_validator(mode="after")

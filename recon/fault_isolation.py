@@ -56,7 +56,8 @@ _AIR_CODES = (
 _AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
 _ABOUT_BOTH = ("clock-lag", "triads-axes")
-_ABOUT_DECELERATION = ("reading-jump", "vacuum-reading")
+# of readings that the drag follows: no likelihood of theirs is for or against another fault
+ABOUT_DECELERATION = ("reading-jump", "vacuum-reading", "lateral-reading")
 INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate was already pulled
 
 
@@ -375,7 +376,7 @@ def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesi
 def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
     """What the failed checks and the comparison of trackers say."""
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in TRIADS]
-    inertial += [v for v in failed if v.code in _ABOUT_BOTH + _ABOUT_DECELERATION]
+    inertial += [v for v in failed if v.code in _ABOUT_BOTH + ABOUT_DECELERATION]
     shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
     out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
     if any(is_about(v, s.source) for v in failed for s in left_out):

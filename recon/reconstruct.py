@@ -58,6 +58,7 @@ from recon import (
 )
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, held_out_table
+from recon.deceleration import deceleration_checks
 from recon.ekf import Problem, with_servo_lag
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
@@ -182,7 +183,8 @@ def reconstruct(
     known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
     solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
     faults: tuple[SingleFault, ...] = ()
-    if any(not check.passed for check in solution.consistency_checks):
+    told = fault_isolation.ABOUT_DECELERATION
+    if any(not check.passed and check.code not in told for check in solution.consistency_checks):
         report(0.5, "trying single faults")
         faults = _single_faults(telemetry, settings, solution)
         telemetry, solution = _with_corrected_clock(telemetry, settings, solution, faults)
@@ -381,9 +383,7 @@ def reconstruct_once(
     table = sensor_error_table(problem, reference, smoothed)
     checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
     checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
-    checks += consistency.vacuum_checks(problem, run, settings.check_confidence)
-    trim_sd = telemetry.motion.trim_sd_rad
-    checks += consistency.reading_jump_checks(problem, run, trim_sd, settings.check_confidence)
+    checks += deceleration_checks(telemetry, problem, run, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += [] if phase is None else [phase.check()]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)

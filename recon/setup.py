@@ -103,6 +103,12 @@ def build_problem(
     track = track_points(used)
     begin = (track[1][0] if stated is None else stated.position_ecef_m) if stated or len(track[0]) else np.zeros(3)
     start_s, end_s = _span(track[0], settings, sensors, telemetry.start, used)
+    if (end_s - start_s) * settings.output_rate_hz > _MOST_NODES:
+        raise GateError(
+            f"reconstruction: from {start_s:.6g} to {end_s:.6g} s there are more than {_MOST_NODES} steps. Check the "
+            "unit of the times and offset_s (readings count from t0), or limit them by use_s",
+            code="flight-too-long",
+        )
     output_s = _output_times(start_s, end_s, settings.output_rate_hz)
     if sensors is not None and settings.pulse_rate_hz > settings.output_rate_hz:
         output_s = _union([output_s, *_pulse_times(instruments, sensors.force, start_s, end_s, settings.pulse_rate_hz)])

@@ -5,7 +5,7 @@ import pytest
 
 import postflight as pf
 from flightmodel import earth
-from flightmodel.checks import DivergenceError, GateError
+from flightmodel.checks import ConfigError, DivergenceError, GateError
 from flightmodel.statistics import chi_square_quantile
 from postflight.run_folder import peak_table
 from recon import smoother
@@ -374,6 +374,75 @@ def test_a_hypothesis_that_diverges_is_no_traceback(tmp_path, monkeypatch):
     with pytest.raises(DivergenceError) as diverged:
         pf.reconstruct(flight)
     assert diverged.value.codes == ("trajectory-diverged",)
+
+
+MISREAD = {
+    "a deceleration counted positive": ("deceleration-sign", lambda rows: rows * [1.0, -1.0], ("", "")),
+    "a spacecraft's clock": ("times-apart", lambda rows: np.array([896220500.0, 0.0]) + rows, ("", "")),
+    "a radius in km": ("state-height", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 3522.2")),
+    "an altitude for a radius": ("state-height", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 126010.0")),
+}
+
+
+@pytest.mark.parametrize("wrong", MISREAD)
+def test_an_entry_that_is_misread_is_refused_by_what_is_wrong(tmp_path, wrong):
+    """check was silent; the run diverged without a word of the sign, or memory ran out."""
+    code, rows, stated = MISREAD[wrong]
+    truth = mars_entry.fly(918, to_s=90.0)
+    mars_entry.write(truth, tmp_path)
+    text = (tmp_path / "flight.toml").read_text()
+    table = np.loadtxt(tmp_path / "accelerometer.csv", delimiter=",", skiprows=1)
+    np.savetxt(tmp_path / "accelerometer.csv", rows(table), "%.6f", ",", header="t_s,ax_mps2", comments="")
+    assert stated[0] in text
+    (tmp_path / "flight.toml").write_text(text.replace(*stated))
+    with pytest.raises((ConfigError, GateError)) as refusal:
+        pf.read_flight(tmp_path)
+    assert refusal.value.codes == (code,)
+
+
+def test_a_spacecraft_s_clock_and_a_positive_deceleration_can_be_stated(tmp_path):
+    """The same state and density, to the bit of the times."""
+    truth = mars_entry.fly(918, to_s=90.0)
+    as_usual = pf.reconstruct(spoilt(truth, tmp_path / "usual", lambda rows: rows)).density
+    spoilt_folder = tmp_path / "other"
+    mars_entry.write(truth, spoilt_folder)
+    table = np.loadtxt(spoilt_folder / "accelerometer.csv", delimiter=",", skiprows=1)
+    table = table * [1.0, -1.0 / 9.80665] + [896220500.0, 0.0]
+    np.savetxt(spoilt_folder / "accelerometer.csv", table, "%.9f", ",", header="SCLK,decel", comments="")
+    text = (spoilt_folder / "flight.toml").read_text()
+    for old, new in (
+        ('axes = ["+x", "+y", "+z"]', 'axes = ["-x", "+y", "-z"]\ntime = { column = "SCLK", offset_s = -896220500.0 }'),
+        ('column = "ax_mps2", unit = "mps2"', 'column = "decel", unit = "g"'),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (spoilt_folder / "flight.toml").write_text(text)
+    found = pf.reconstruct(pf.read_flight(spoilt_folder)).density
+    np.testing.assert_allclose(found.density_kgpm3, as_usual.density_kgpm3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 10.0])
+def test_forces_across_the_axis_show_one_that_is_off(tmp_path, off_deg):
+    """An axis 10 deg off takes 1.5 % from the deceleration: speed 7 sd wrong, all green; ay and az were not read."""
+    truth = mars_entry.fly(919, to_s=100.0)
+    mars_entry.write(truth, tmp_path)
+    table = np.loadtxt(tmp_path / "accelerometer.csv", delimiter=",", skiprows=1)
+    rng, trim = np.random.default_rng(919), np.deg2rad(1.0)
+    across = 0.02 * rng.standard_normal((2, len(table)))
+    turned = np.deg2rad(off_deg) * np.array([1.0, 0.0])[:, None] + trim * np.array([0.6, 0.8])[:, None]
+    rows = np.column_stack([table[:, 0], table[:, 1] * np.cos(np.deg2rad(off_deg)), *(across + turned * table[:, 1])])
+    np.savetxt(tmp_path / "accelerometer.csv", rows, "%.6f", ",", header="t_s,ax,ay,az", comments="")
+    text = (tmp_path / "flight.toml").read_text()
+    text = text.replace('measures = ["ax"]\n', "")
+    columns = ", ".join(f'{a} = {{ column = "{a}", unit = "mps2" }}' for a in ("ax", "ay", "az"))
+    text = text.replace('{ ax = { column = "ax_mps2", unit = "mps2" } }', f"{{ {columns} }}")
+    (tmp_path / "flight.toml").write_text(text)
+    bet = pf.reconstruct(pf.read_flight(tmp_path))
+    (check,) = (one for one in bet.consistency_checks if one.code == "lateral-reading")
+    assert check.passed == (off_deg == 0.0)
+    (degrees,) = numbers_in(check.symptom)
+    assert degrees == pytest.approx(off_deg + 0.6, abs=0.5)
+    assert [one.code for one in bet.suspects] == ([] if off_deg == 0.0 else ["inertial-sensors"])
 
 
 def test_milliseconds_as_seconds_are_refused(tmp_path):
