@@ -124,6 +124,7 @@ _MARS_PRESSURE_PA = 636.0  # at height 0; over a year and over the planet's weat
 # `temperature_sd` does to the weight of the air below, d ln p = (g / R T) (dT / T) dz, where temperatures err alike
 # over two scale heights (assumed), on 12 % of the ground's pressure. A dust storm's air is two to three of them denser.
 _MARS_DENSITY_SD = np.array([[0.0, 40e3, 80e3, 130e3], [0.12, 0.3, 0.7, 1.1]])
+_US76_DENSITY_SD = np.array([[40e3, 50e3, 60e3, 70e3, 80e3, 100e3, 110e3], [0.1, 0.14, 0.19, 0.23, 0.24, 0.24, 0.28]])
 _MARS_WIND_SD_MPS = 25.0  # of each component; assumed
 _MARS_MEAN_RADIUS_M = 3389.5e3
 # mole fractions of carbon dioxide, of N2, O2 and CO, and of argon
@@ -522,16 +523,18 @@ def standard_atmosphere() -> AtmosphereProfile:
 def standard_sounding(planet: Planet = WGS84) -> Sounding:
     """US76 without winds in the form of a sounding, 0 to 120 km, for a flight of which no sounding was made.
 
-    Density is uncertain by 10 % and each component of the wind by 15 m/s: the day's departure from the standard in
-    middle latitudes and the usual winds of the stratosphere, not an instrument's error; temperature by
-    `standard_temperature_sd`. Of Mars, 0 to 250 km, by what stands beside its temperatures above.
+    What a day's air differs from the standard, not an instrument's error: density by 10 % to 40 km, 19 % at 60 km, 24 %
+    from 80 km, 28 % from 110 km, temperature by `standard_temperature_sd`; each component of the wind by 15 m/s, as is
+    usual in the stratosphere. Density is the rms of NRLMSIS 2.1 less US76 as of the temperature there, but no less than
+    10 % (3 % at the ground, 6 % at 30 km): over all latitudes it is up to 1.7 times as large, at 40 km. Of Mars, 0 to
+    250 km, by what stands beside its temperatures above.
     """
     if planet != WGS84:
         z = np.arange(BOTTOM_MARS_M, 250001.0, 1000.0)
         sd = default_sounding_sd(z, planet)
     else:
         z = np.arange(0.0, 120001.0, 1000.0)
-        sd = np.full(len(z), 0.10), np.full(len(z), 15.0)
+        sd = np.interp(z, *_US76_DENSITY_SD), np.full(len(z), 15.0)
     still = np.zeros(len(z))
     return Sounding(z, *standard_air(z, planet), still, still, *sd, planet, standard_temperature_sd(z, planet))
 

@@ -590,7 +590,8 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
         gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
         return standard_sounding(spec.body)
     words = (
-        "no [atmosphere]: the US Standard Atmosphere 1976 without wind stands for it, density to 10 %, wind to 15 m/s"
+        "no [atmosphere]: the US Standard Atmosphere 1976 stands for it, density to 10 % (24 % from 80 km), "
+        "wind to 15 m/s"
     )
     gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
     return standard_sounding()

@@ -90,7 +90,8 @@ def test_standard_air_stands_in_and_is_told(folder):
     air = telemetry.sounding
     assert (air.altitude_m[0], air.altitude_m[-1]) == (0.0, 120e3)
     np.testing.assert_array_equal(air.density_kgpm3, us76(air.altitude_m)[0])
-    assert set(air.density_sd) == {0.10}
+    assert set(air.density_sd[air.altitude_m <= 40e3]) == {0.10}
+    assert set(air.density_sd[(air.altitude_m >= 80e3) & (air.altitude_m <= 100e3)]) == {0.24}
     assert set(air.wind_sd_mps) == {15.0}
     assert not air.wind_north_mps.any()
 
