@@ -24,13 +24,14 @@ from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import Angle, Elevation, KeyFaults, Latitude, Longitude, Section, Time
 from flightmodel.gate import Gate
 from flightmodel.tables import Source
-from flightmodel.telemetry import StatedDrag, StatePrior
+from flightmodel.telemetry import Finding, StatedDrag, StatePrior
 
 Axes = Literal["fixed", "inertial", "j2000"]
 Triple = tuple[float, float, float]
 Size = Annotated[float, Field(gt=0.0, le=1e8)]
 Percent = Annotated[float, Field(ge=0.0, le=300.0)]
 _LOWEST_M, _HIGHEST_M = -1e4, 1e6  # Hellas; beyond the atmospheres' tables
+_SUPERSONIC, _MOST_C_A = 2.0, 2.0  # Newtonian flow: 2 sin^2 of a plate across it; behind a normal shock it is less
 _CARTESIAN = ("position_m", "velocity_mps")
 _SPHERICAL = ("latitude_deg", "longitude_deg", "speed_mps", "flight_path_deg", "azimuth_deg")
 
@@ -214,6 +215,13 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
             gate.refuse(f"drag.table: {table.path}: Mach numbers grow from row to row, without gaps", "mach-order")
         if len(gate.faults) > before:
             return None
+    fast = (mach >= _SUPERSONIC) | (len(mach) == 1)
+    if fast.any() and (largest := float(c_a[fast].max())) > _MOST_C_A:
+        words = (
+            f"C_A of {largest:.3g}: stagnation pressure on all of the frontal area gives {_MOST_C_A:g}; "
+            "is area_m2 or diameter_m of the same reference as c_a?"
+        )
+        gate.findings.append(Finding("drag", words, np.nan, np.nan, code="drag-large"))
     area = entry.area_m2 if entry.diameter_m is None else 0.25 * np.pi * entry.diameter_m**2
     assert area is not None
     sd = 0.01 * float(np.hypot(entry.c_a_sd_percent, entry.mass_sd_percent))

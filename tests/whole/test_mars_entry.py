@@ -421,6 +421,16 @@ def test_a_spacecraft_s_clock_and_a_positive_deceleration_can_be_stated(tmp_path
     np.testing.assert_allclose(found.density_kgpm3, as_usual.density_kgpm3, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("c_a", "large"), [("1.99", False), ("2.6", True)])
+def test_a_drag_beyond_newton_s_is_told(tmp_path, c_a, large):
+    """As of an area that is not the frontal one; it was taken without a word."""
+    mars_entry.write(mars_entry.fly(920, to_s=20.0), tmp_path)
+    text = (tmp_path / "flight.toml").read_text()
+    assert text.count("c_a = 1.7") == 1
+    (tmp_path / "flight.toml").write_text(text.replace("c_a = 1.7", f"c_a = {c_a} #"))
+    assert ("drag-large" in [finding.code for finding in pf.read_flight(tmp_path).findings]) == large
+
+
 @pytest.mark.parametrize("off_deg", [0.0, 10.0])
 def test_forces_across_the_axis_show_one_that_is_off(tmp_path, off_deg):
     """An axis 10 deg off takes 1.5 % from the deceleration: speed 7 sd wrong, all green; ay and az were not read."""
