@@ -60,6 +60,7 @@ _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
 _APART_S, _NOISE_SPAN_S = 2, 11  # a parachute inflates within a second or two; over a few seconds noise is the same
 _WAVES = 0.14  # of density over a kilometre or two: waves of 20 K in 140 K, assumed
+_SWING = 0.005  # of an axial force, while the vehicle swings by 4 deg; in level flight nothing else changes
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
 
 
@@ -387,7 +388,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     waves = np.minimum(np.sqrt(1.0 - SOUNDING_CONSTANT_PART) * stated.at(heights[1]).density_sd, _WAVES)
     weather = 2.0 * forgotten * waves**2
     change = after["log_ratio"].to_numpy() - before["log_ratio"].to_numpy()
-    jump = change / np.sqrt(weather + noise.to_numpy()[last] + noise.to_numpy()[at[last]])
+    jump = change / np.sqrt(weather + _SWING**2 + noise.to_numpy()[last] + noise.to_numpy()[at[last]])
     worst = int(np.argmax(np.abs(jump)))
     when = f"from {before.index[worst]} to {after.index[worst]} s"
     found = f"{np.exp(change[worst]):.2g} times the stated atmosphere's change {when}"
