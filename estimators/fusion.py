@@ -212,7 +212,7 @@ def fuse(
     method : str
         Name of the answer.
     at_s : (n,) float, optional
-        Times of the answer, s; else those of the method with most samples.
+        Times of the answer, s; else those of the method with most samples, and as dense in its gaps.
     near_s : float
         An answer is given no further from a reading.
     free_process : bool
@@ -262,7 +262,8 @@ def fuse(
         if moved < SETTLED_SD and step > 0:
             if free_process:
                 _check_inputs(new, input_posterior, method)
-            times = max(readings, key=lambda e: len(e.time_s)).time_s if at_s is None else at_s
+            densest = max(readings, key=lambda e: len(e.time_s)).time_s
+            times = _without_holes(densest) if at_s is None else at_s
             times = times[_apart_from_readings(times, readings) <= near_s]
             if free_process:
                 answer, size_radps2 = problem.smoothed(input_posterior, method)
@@ -476,6 +477,15 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
                 "answer",
                 input_posterior,
             )
+
+
+def _without_holes(time_s: FloatArray) -> FloatArray:
+    """Times with others, as far apart as is usual, where some are missing."""
+    step = np.diff(time_s)
+    missing = np.round(step / np.median(step)).astype(np.int64) - 1
+    hole = np.flatnonzero(missing > 0)
+    more = [np.linspace(time_s[k], time_s[k + 1], missing[k] + 2)[1:-1] for k in hole]
+    return np.sort(np.concatenate([time_s, *more]))
 
 
 def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatArray:

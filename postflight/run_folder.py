@@ -252,7 +252,8 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
             mean, mean_sd = np.rad2deg(mean_over(any_time, cycle))
             out[method] |= {"mean_deg": float(mean), "mean_sd_deg": float(mean_sd), "mean_over_s": list(cycle)}
         if not np.isfinite(theta):
-            words = f"no data at {at_s:.2f} s; answers span {known[0]:.2f} to {known[-1]:.2f} s"
+            gap = ": a gap" if known[0] < at_s < known[-1] else ""
+            words = f"no data at {at_s:.2f} s{gap}; answers span {known[0]:.2f} to {known[-1]:.2f} s"
             out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": words, "code": "no-answer"}
     for method, reason in answers.refused.items():
         out[method] = {

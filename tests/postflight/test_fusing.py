@@ -77,6 +77,21 @@ def test_a_film_that_is_early_by_most_of_a_period_has_its_time_bias():
     assert bias.offset_s == pytest.approx(-1.5, abs=4.0 * bias.sd_s)
 
 
+def test_a_film_carries_the_answer_through_a_gap_of_the_sensors():
+    loads = sound()
+    gap = TIME_S[K] + np.array([-1.5, 1.5])
+    loads = loads.rows((loads.time_s < gap[0]) | (loads.time_s > gap[1]))
+    filmed, without = (fuse_flight(loads, f).fused.history for f in (film(motion()), None))
+    inside = (filmed.time_s > gap[0]) & (filmed.time_s < gap[1])
+    assert np.diff(filmed.time_s).max() < 0.06
+    off = filmed.theta_rad[inside] - np.linalg.norm(motion(filmed.time_s[inside]), axis=1)
+    assert np.abs(off / filmed.theta_sd_rad[inside]).max() < 3.0
+    # a film alone knows it less well than all methods
+    assert np.median(filmed.theta_sd_rad[inside]) > 1.2 * np.median(filmed.theta_sd_rad[~inside])
+    # no answer is far from a reading
+    assert np.diff(without.time_s).max() == pytest.approx(2.0, abs=0.11)
+
+
 def test_a_turned_accelerometer_is_left_out():
     loads = sound()
     # the force alone is turned by 2 deg, far beyond what its bias and mounting are known to; the attitude is right
