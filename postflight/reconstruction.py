@@ -47,6 +47,7 @@ from recon.atmosphere import (
     ReconstructedAir,
     as_flown_atmosphere,
     cg_accelerations,
+    too_sparse,
     windows_are_whole,
 )
 from recon.consistency import ConsistencyCheck
@@ -512,6 +513,8 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
     begins, ends, vehicle = next(p for p in whole.phases(-np.inf, np.inf) if p[0] <= peak_s < p[1])
     inside &= (grid >= begins) & (grid < ends)
     t = grid[inside]
+    if len(t) == 0:
+        raise too_sparse(bet, 4.0 * HALF_WINDOW_S)
     step = np.median(np.diff(bet.imu_time_s)) if len(bet.imu_time_s) > 1 else 0.0
     turning_radps = fastest_radps(vehicle, bet, air)
     wanted = _HALF_WINDOW_S if turning_radps <= 0.0 else min(_HALF_WINDOW_S, _MOST_TURN_RAD / turning_radps)

@@ -74,7 +74,7 @@ HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
 _EDGE_S = 0.05  # half the windows over which rates are averaged at both ends
 _POINTS = 9  # at which a window's attitude is interpolated
-_LARGEST_GAP_S = 0.1  # beside a longer one a window's mean is not of its middle
+LARGEST_GAP_S = 0.1  # beside a longer one a window's mean is not of its middle
 
 
 @dataclass(frozen=True)
@@ -503,10 +503,20 @@ def _without_gap(t_imu: FloatArray, at: FloatArray, reach_s: float) -> BoolArray
     """Mask (n,) of times with sensor data to both sides and no gap beside which a mean is not of its middle."""
     if len(t_imu) < 2:
         return np.zeros(len(at), dtype=bool)
-    gap = np.flatnonzero(np.diff(t_imu) > _LARGEST_GAP_S + 1e-6)  # tags are decimals: ten a second are not quite
+    gap = np.flatnonzero(np.diff(t_imu) > LARGEST_GAP_S + 1e-6)  # tags are decimals: ten a second are not quite
     ends = np.concatenate([[-np.inf], t_imu[gap + 1]])  # of the gap before the first there is none
     last = ends[np.searchsorted(t_imu[gap], at + reach_s)]  # of the gaps that begin before the window ends
     return np.asarray((at - reach_s >= t_imu[0]) & (at + reach_s <= t_imu[-1]) & (at - reach_s >= last))
+
+
+def too_sparse(bet: TrajectorySolution, window_s: float) -> GateError:
+    """Say that no window of so many seconds has whole inertial data."""
+    usual = float(np.median(np.diff(bet.imu_time_s))) if len(bet.imu_time_s) > 1 else np.inf
+    return GateError(
+        f"accelerometer and rates: no {window_s:.1f} s with samples of both at most {LARGEST_GAP_S:g} s apart "
+        f"(usually {usual:.3g} s): forces at the c.g. need ten samples a second; deliver the data at their full rate",
+        code="samples-too-sparse",
+    )
 
 
 def cg_accelerations(
@@ -553,6 +563,8 @@ def _air_samples(telemetry: Telemetry, bet: TrajectorySolution) -> AirSamples:
     cg = telemetry.required_vehicle().cg_m
     accelerometer, _ = telemetry.required_triads()
     t = _window_times(bet)
+    if len(t) == 0:
+        raise too_sparse(bet, _WINDOW_S + 2.0 * _EDGE_S)
     arm = cg - accelerometer.spec.position_from_datum_body_m
     inside = _WINDOW_S * ((np.arange(_POINTS) + 0.5) / _POINTS - 0.5)
     dense = resample(bet.smoothed, (t[:, None] + inside).ravel())

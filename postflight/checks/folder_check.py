@@ -221,7 +221,13 @@ def _cross_check(found: Sources, report: Report) -> None:
     # an entry's one channel has neither a size nor axes to compare
     whole = {name: t for name, t in found.triads.items() if np.isfinite(t.measured_sensor).any(axis=0).all()}
     found, remarks = replace(found, triads=whole), report.cross_checks
-    remarks += tracks.outside_time(found) + inertial.at_rest(found) + inertial.lever(found) + inertial.place(found)
+    remarks += (
+        inertial.sparse(found)
+        + tracks.outside_time(found)
+        + inertial.at_rest(found)
+        + inertial.lever(found)
+        + inertial.place(found)
+    )
     for radar in found.radars.values():
         remarks += tracks.free_fall(found, radar)
     for fixes in found.gnss.values():

@@ -41,6 +41,7 @@ from postflight.checks.units_and_axes import (
     unit_that_explains,
     window_means,
 )
+from recon.atmosphere import LARGEST_GAP_S
 
 _REST_S = 2.0  # at the record's ends, before release or after landing
 _REST_SPREAD = 0.02  # of the reading's magnitude: at rest it is steadier
@@ -66,6 +67,21 @@ _SLIPS = {
     Fault("with the scalar last, so put its last number first", "attitude-scalar-last"): [3, 0, 1, 2],
     Fault("as from ECEF to body, so change the signs of its last three numbers", "attitude-inverted"): None,
 }
+
+
+def sparse(found: Sources) -> list[Finding]:
+    """Name sensors whose samples are too far apart for the forces of a flight (``samples-too-sparse``)."""
+    if found.spec.motion.model == "ballistic":
+        return []
+    out = []
+    for name in ("accelerometer", "rates"):
+        record = found.triads.get(name)
+        step = 0.0 if record is None or len(record.time_s) < 2 else float(np.median(np.diff(record.time_s)))
+        if record is not None and step > 1.01 * LARGEST_GAP_S:
+            words = f"samples are usually {step:.3g} s apart: forces at the c.g. need ten a second, an attitude more"
+            ends = float(record.time_s[0]), float(record.time_s[-1])
+            out.append(Finding(name, f"{words}; deliver the data at their full rate", *ends, "samples-too-sparse"))
+    return out
 
 
 def at_rest(found: Sources) -> list[Finding]:

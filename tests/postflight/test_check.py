@@ -115,6 +115,12 @@ time_bias_sd_s = 0.0
     assert [fact.source for fact in report.facts] == ["accelerometer", "nav"]
 
 
+def test_samples_too_far_apart_for_forces_are_named(folder):
+    change(folder, "rates.csv", lambda t: t.iloc[::100])
+    assert ("rates", "samples-too-sparse") in remarks(folder)
+    assert ("accelerometer", "samples-too-sparse") not in remarks(folder)
+
+
 def test_accelerometer_in_g_read_as_metres(folder):
     edit(folder, ('unit = "g"', 'unit = "mps2"'))
     source, code, words = only(folder)

@@ -8,7 +8,7 @@ import pytest
 
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
-from recon.atmosphere import HALF_WINDOW_S, windows_are_whole
+from recon.atmosphere import HALF_WINDOW_S, _air_samples, windows_are_whole
 from recon.imu_screening import bridge, frozen_samples
 from recon.reconstruct import corrected_series
 from tests.refusing import refuses
@@ -164,3 +164,14 @@ def test_windows_that_reach_into_a_gap_are_left_out():
     tenths = np.round(np.arange(437.0, 447.0, 0.1), 6)
     assert windows_are_whole(SimpleNamespace(imu_time_s=tenths), np.array([440.05, 441.0])).all()
     assert not windows_are_whole(SimpleNamespace(imu_time_s=tenths[:1]), grid).any()
+
+
+def test_sensors_too_sparse_for_forces_are_refused_in_words():
+    vehicle = SimpleNamespace(cg_m=np.zeros(3))
+    telemetry = SimpleNamespace(
+        required_vehicle=lambda: vehicle,
+        required_triads=lambda: (SimpleNamespace(spec=SPEC), SimpleNamespace(spec=SPEC)),
+    )
+    t = np.arange(0.0, 20.0, 0.25)
+    with refuses("samples-too-sparse", names=("0.25 s",)):
+        _air_samples(telemetry, SimpleNamespace(imu_time_s=t, smoothed=SimpleNamespace(time_s=t)))
