@@ -34,7 +34,7 @@ from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import return_large_arrays, write_out
 from postflight.studies.preflight import Bounds, entry_bounds
-from postflight.terminal import progress_bar, terminal
+from postflight.terminal import few_of_each, progress_bar, terminal
 from recon.consistency import ConsistencyCheck
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
@@ -349,8 +349,8 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     console.print(table)
     if not flight.peak_is_inside:
         line("[yellow]found[/]", "the data end before or begin after the peak of dynamic pressure", "peak-outside-data")
-    for finding in (*flight.findings, *run_folder.without_attitude(flight)):
-        line("[yellow]found[/]", str(finding), finding.code)
+    for words, code in few_of_each((*flight.findings, *run_folder.without_attitude(flight))):
+        line("[yellow]found[/]", words, code)
     for reason in () if flight.density is not None else flight.missing:  # that is as flown, too
         line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
@@ -489,8 +489,8 @@ def deflection(
                     for name, (seen, own) in by_camera(telemetry, history).items():
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
                         write_overlay_film(seen, own, out.path / "figures" / file, progress=report)
-    for finding in telemetry.findings:
-        line("[yellow]found[/]", str(finding), finding.code)
+    for words, code in few_of_each(telemetry.findings):
+        line("[yellow]found[/]", words, code)
     if trouble:
         line("[yellow]no trajectory[/],", f"the camera answers alone: {trouble}", trouble.code)
     print_answers(answers)

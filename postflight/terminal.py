@@ -4,11 +4,12 @@ reader cannot end; progress is a bar on a terminal, and a plain line now and the
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -16,6 +17,9 @@ from rich.segment import Segment
 
 from flightmodel.checks import Progress
 from postflight.streams import into_nothing, visible
+
+if TYPE_CHECKING:  # a first line waits for no numpy
+    from flightmodel.telemetry import Finding
 
 
 class Terminal(Console):
@@ -34,6 +38,24 @@ class Terminal(Console):
 def terminal(**options: Any) -> Terminal:
     """Return a console of the project's settings on standard output, or on standard error where asked."""
     return Terminal(soft_wrap=True, **options)
+
+
+MOST_ALIKE = 5  # findings of one kind that a reader wants line by line
+
+
+def few_of_each(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+    """Words and code of findings; of many of one source and code the first, and how many more there are, until when."""
+    alike: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        alike.setdefault((finding.source, finding.code), []).append(finding)
+    out = []
+    for (source, code), same in alike.items():
+        shown = same if len(same) <= MOST_ALIKE else same[: MOST_ALIKE - 1]
+        out += [(str(finding), code) for finding in shown]
+        if len(shown) < len(same):
+            until = f", the last until {same[-1].end_s:.3f} s" if math.isfinite(same[-1].end_s) else ""
+            out.append((f"{source}: {len(same) - len(shown)} more of these{until}", code))
+    return out
 
 
 # progress of a long command: a bar on a terminal, a plain line now and then where standard error is none

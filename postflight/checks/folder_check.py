@@ -33,7 +33,7 @@ from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
 from postflight.streams import write_out
-from postflight.terminal import terminal
+from postflight.terminal import few_of_each, terminal
 
 _SHARP_S = 0.5  # a time bias of a larger standard deviation is not reported
 _FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe the comparison
@@ -335,8 +335,8 @@ def print_report(report: Report) -> None:
             span = (f"{f.start_s:.3f}", f"{f.end_s:.3f}", f"{f.rate_hz:.4g}")
             table.add_row(escape(f.source), str(f.rows), *span, str(f.missing), escape(f.file))
         console.print(table)
-    for finding in report.findings:
-        _line("[yellow]found[/]", str(finding), finding.code)
+    for words, code in few_of_each(report.findings):
+        _line("[yellow]found[/]", words, code)
     for remark in report.cross_checks:
         _line("[red]suspicious[/]", str(remark), remark.code)
     for bias in report.time_biases:
@@ -345,8 +345,8 @@ def print_report(report: Report) -> None:
     for section, sizes in report.assumed.items():
         keys = ", ".join(f"{key} = {size:g}" for key, size in sizes.items())
         _line("[yellow]assumed[/]", f"[{section}] {keys}: not stated in flight.toml", "default-assumed")
-    for words in report.fill_in:
-        _line("[cyan]to fill in[/]", words, "placeholder")
+    for open_key in report.fill_in:
+        _line("[cyan]to fill in[/]", open_key, "placeholder")
     for fault in report.refused:
         _line("[red]refused[/]", fault, fault.code)
     console.print(report._about())
