@@ -156,6 +156,10 @@ def read_gnss(
     if not np.isfinite(measured).all(axis=1).any():
         gate.refuse(f"{label}: {table.path}: no fix with a whole {what}; remove the receiver", "no-samples")
         return None
+    new = _new_fixes(np.column_stack([position, velocity]))
+    if 2 <= new.sum() < len(new):
+        gate.findings.append(_held(name, time_s, new))
+        time_s, table, position, velocity = time_s[new], table.of_rows(new), position[new], velocity[new]
     position, velocity = fixed_axes(source.axes, t0_utc, time_s, position, velocity, planet)
     gate.findings.extend(find_faults(name, time_s, names, velocity if alone else position))
     gate.findings.extend(oversampled(name, time_s, source.every_s, source.components))
@@ -181,6 +185,24 @@ def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> B
             "fixes-poor",
         )
     return good
+
+
+def _new_fixes(values: FloatArray) -> BoolArray:
+    """Which rows (n,) of positions and velocities (n, 6) differ from the row before; NaN is equal to NaN."""
+    same = (values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))
+    return np.append(True, ~same.all(axis=1) | np.isnan(values[1:]).all(axis=1))
+
+
+def _held(name: str, time_s: FloatArray, new: BoolArray) -> Finding:
+    """Say that a log writes the receiver's last fix until the next: it is one measurement, of its first row's time."""
+    first = np.flatnonzero(new)
+    held = time_s[np.append(first[1:], len(new)) - 1] - time_s[first]
+    k = int(np.argmax(held))
+    words = (
+        f"{int((~new).sum())} of {len(new)} rows hold the fix of the row before and are left out, for up to "
+        f"{held[k]:.3g} s: a fix counts once, at the time of its first row"
+    )
+    return Finding(name, words, float(time_s[first[k]]), float(time_s[first[k]] + held[k]), code="fixes-held")
 
 
 def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet) -> FloatArray | None:

@@ -180,6 +180,25 @@ def test_weak_fixes_are_left_out_and_counted(folder):
     assert numbers_in(findings(telemetry, "gps")["fixes-poor"]) == [10.0, 40.0, 7.0]
 
 
+def test_a_fix_that_is_held_until_the_next_counts_once(folder):
+    # a log at 2 Hz of a receiver at 0.5 Hz, that loses its last two fixes
+    at = np.minimum(2.0 * np.floor(T / 2.0), 16.0)
+    fix = (LAT + 1e-5 * at, LON + 0 * at, 1400 + 50 * at)
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,horizontal_sd_m", T, *fix, 2 + T)
+    telemetry = folder.read(GNSS, BALLISTIC)
+    record = telemetry.gnss["gps"]
+    np.testing.assert_array_equal(record.time_s, np.arange(0.0, 17.0, 2.0))
+    np.testing.assert_allclose(record.sd[:, 0], 2 + record.time_s)
+    found = findings(telemetry, "gps")
+    assert numbers_in(found["fixes-held"]) == [31.0, 40.0, 3.5]
+    assert "data-frozen" not in found
+    # what moves in one column is a fix of its own, and so is one without a position where the velocity goes on
+    folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,vn_mps,ve_mps,vd_mps", T, *fix, T, 0 * T, 0 * T)
+    telemetry = folder.read(GNSS, BALLISTIC)
+    assert len(telemetry.gnss["gps"].time_s) == len(T)
+    assert "fixes-held" not in findings(telemetry, "gps")
+
+
 def test_empty_cells_are_missing_fixes(folder):
     alt = np.where(T == 3.0, np.nan, 1400 + T)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m", T, LAT + 0 * T, LON + 0 * T, alt)
