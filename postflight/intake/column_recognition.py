@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -68,9 +68,12 @@ _THREE_AXIS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "rate": ("sensors.rates", tables.RATES),
     "magnetic field": ("sensors.magnetometer", tables.MAGNETOMETER),
 }
+_ENDINGS = {"radars": "_radar", "gnss": "_gnss", "barometers": "_baro"}
 _MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 _AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
 _AIR_BY_COMPONENTS = ("wind_north", "wind_east")
+_RECEIVER = {"gps", "gnss", "hae", "ellipsoid"}  # in the name of a height
+_OF_AIR = {"baro", "barometer", "barometric", "pressure", "press", "qnh"}
 _Family = tuple[tuple[str, ...], str]
 
 
@@ -88,7 +91,10 @@ class ColumnProposal:
 
 @dataclass(frozen=True)
 class TimeProposal:
-    """Where the time is: columns, format, unit (of seconds; empty where it is asked), other candidates."""
+    """Where the time is: columns, format, unit (of seconds; empty where it is asked), other candidates.
+
+    ``repeats``: of rows of one time the first is meant.
+    """
 
     columns: tuple[str, ...]
     format: str
@@ -97,6 +103,7 @@ class TimeProposal:
     why: str
     offset_asked: bool = False
     others: tuple[str, ...] = ()
+    repeats: bool = False
 
 
 @dataclass
@@ -208,7 +215,7 @@ def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | N
     parts = _hour_minute_second(table, named)
     seconds = [k for k in range(len(named)) if _is_time(named[k], table.numbers(k))]
     # a time of day is known to the second of UTC; a counter's zero is not
-    if parts and not any(table.names[k] == "t_s" for k in seconds):
+    if parts and not any(table.names[k] == "t_s" for k in seconds) and not _coarser(table, parts, seconds):
         others = tuple(table.names[k] for k in seconds)
         return TimeProposal(parts, "utc_hms", "", STATED, "hour, minute and second of the day", others=others)
     if not seconds:
@@ -218,6 +225,15 @@ def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | N
     unit, how, why = _time_unit(named[best], table.numbers(best))
     asked = bool(set(named[best].tokens) & _NOT_FROM_T0)
     return TimeProposal((table.names[best],), "seconds", unit, how, why, asked, others)
+
+
+def _coarser(table: FreeFormTable, parts: tuple[str, ...], seconds: list[int]) -> bool:
+    """Whether most rows repeat the time of day of the row before, while a counter of seconds runs on in them."""
+    of_day = np.column_stack([table.numbers(table.names.index(c)) for c in parts])
+    again = (of_day[1:] == of_day[:-1]).all(axis=1)
+    if again.mean() <= 0.5:
+        return False
+    return any((np.diff(table.numbers(k))[again] > 0.0).mean() > 0.5 for k in seconds)
 
 
 def _hour_minute_second(table: FreeFormTable, named: list[ColumnName]) -> tuple[str, ...] | None:
@@ -275,6 +291,7 @@ class Recogniser:
         self.table = table
         self.named = column_names(table)
         self.time = find_time(table, self.named)
+        self.fix_time = self._time_of_fixes()
         self.free = set(range(len(table.names)))
         self.spare: set[int] = set()  # understood, and not used
         if self.time is not None:
@@ -294,8 +311,20 @@ class Recogniser:
         else:
             found = self._three_axis_sensors() + self._radar() + self._receiver() + self._barometer()
         for source in found:
-            source.time = self.time
-        return found, [self.table.names[k] for k in sorted(self.free | self.spare)]
+            is_receiver = source.section.startswith("gnss.")
+            source.time = self.fix_time if is_receiver and self.fix_time is not None else self.time
+        return _named_apart(found), [self.table.names[k] for k in sorted(self.free | self.spare)]
+
+    def _time_of_fixes(self) -> TimeProposal | None:
+        """Time of day that a faster log repeats until the next fix: the fix's own; None where there is none."""
+        if self.time is None or self.time.format != "seconds" or self.time.columns == ("t_s",):
+            return None
+        parts = _hour_minute_second(self.table, self.named)
+        if parts is None:
+            return None
+        zero = " ".join(self.time.columns)
+        why = f"hour, minute and second repeat until the next fix: its own; t0_utc is then when '{zero}' is 0"
+        return TimeProposal(parts, "utc_hms", "", STATED, why, others=self.time.columns, repeats=True)
 
     # three axes
 
@@ -332,6 +361,8 @@ class Recogniser:
         worded = [kind for kind, vocabulary in VECTORS.items() if matching(stem, vocabulary)]
         if family == "body" and (not stem or "rate" in worded or stated == {"rate"}):
             return ("rate", "names of body rates") if stated in (set(), {"rate"}) else ("", "")
+        if not stated and not worded and "g" in stem and self._beside_accelerometer(at):
+            return "rate", "beside ax, ay, az"
         fitting = [kind for kind in worded if not stated or kind in stated]
         if len(stated) == 1:
             kind = next(iter(stated))
@@ -344,6 +375,19 @@ class Recogniser:
         if stated and len(fitting) != 1:
             return "", ""
         return (fitting[0], "name") if len(fitting) == 1 else ("", "")
+
+    def _beside_accelerometer(self, at: list[int]) -> bool:
+        """Whether gx, gy, gz stand beside ax, ay, az without other gyros, and are not gravity's direction."""
+        every = {named.tokens for named in self.named}
+        mates = [tuple("a" + t[1:] if t in ("gx", "gy", "gz") else t for t in self.named[k].tokens) for k in at]
+        if not all(m in every and m != self.named[k].tokens for m, k in zip(mates, at, strict=True)):
+            return False
+        families = self._families()
+        if any(family == "body" or matching(stem, VECTORS["rate"]) for stem, family in families):
+            return False
+        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
+        size = size[np.isfinite(size)]
+        return len(size) > 0 and float(size.std()) > _STEADY * float(size.mean())
 
     def _is_g(self, at: list[int]) -> bool:
         """Whether ``g`` is no gauss: a small letter, or of a magnitude that the Earth's field has nowhere."""
@@ -396,9 +440,11 @@ class Recogniser:
             found = [k for k in found if not set(tokens[k]) & QUANTITIES["wind_from"]]
         return sorted(found, key=lambda k: (len(set(tokens[k]) - words), k))
 
-    def _single(self, quantity: Quantity, vocabulary: str = "") -> ColumnProposal | None:
-        """Claim the column of one quantity; None where there is none."""
-        for k in self.columns_of(vocabulary or quantity.short):
+    def _single(
+        self, quantity: Quantity, vocabulary: str = "", among: list[int] | None = None
+    ) -> ColumnProposal | None:
+        """Claim the column of one quantity, the first that fits; None where there is none."""
+        for k in self.columns_of(vocabulary or quantity.short) if among is None else among:
             stated = self.named[k].kinds
             if stated and quantity.kind not in stated:
                 continue
@@ -430,9 +476,16 @@ class Recogniser:
         return found
 
     def _radar(self) -> list[SourceProposal]:
-        """Slant range, azimuth, elevation."""
+        """Slant range, azimuth, elevation; angles in whole degrees beside fixes are computed from these."""
         if not all(self.columns_of(q.short) for q in tables.RADAR):
             return []
+        if all(self.columns_of(short) for short in ("lat", "lon")):
+            first = [self.columns_of(q.short)[0] for q in tables.RADAR]
+            known = [v[np.isfinite(v)] for v in map(self.table.numbers, first[1:])]
+            if all((v == np.round(v)).all() for v in known):
+                names = ", ".join(f"'{self.table.names[k]}'" for k in first)
+                self.table.notes.append(f"{names}: whole degrees beside fixes are taken as computed from these")
+                return []
         found = [self._single(q) for q in tables.RADAR]
         if any(m is None for m in found):
             return []
@@ -446,13 +499,14 @@ class Recogniser:
     def _receiver(self) -> list[SourceProposal]:
         """Positions by latitude and longitude or ECEF, velocities."""
         quantity = {q.short: q for q in tables.GNSS}
+        beside = [k for short in ("lat", "lon") for k in self.columns_of(short)[:1]]
         ecef = self._vectors("length", ("x", "y", "z"))
         lat_lon = [] if ecef else [m for s in ("lat", "lon") if (m := self._single(quantity[s]))]
         if not ecef and len(lat_lon) < 2:
             return []
         found, keys = list(ecef or lat_lon), []
         if not ecef:
-            height, key = self._height(quantity["alt"])
+            height, key = self._height(quantity["alt"], beside)
             found += [height] if height else []
             keys += key
         for shorts in (("vx", "vy", "vz"), ("vn", "ve", "vd")):
@@ -497,17 +551,31 @@ class Recogniser:
         size: FloatArray = np.linalg.norm(np.column_stack(axes), axis=1)
         return bool(_EARTH_RADII_M[0] < np.nanmedian(size) < _EARTH_RADII_M[1])
 
-    def _height(self, quantity: Quantity) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
-        candidates = self.columns_of("alt")
+    def _height(
+        self, quantity: Quantity, beside: list[int]
+    ) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
+        """Claim a receiver's height: by its name, then the one that stands next to its latitude and longitude."""
+        candidates = sorted(self.columns_of("alt"), key=lambda k: self._strangeness(k, beside))
         ell = [k for k in candidates if set(self.named[k].tokens) & {"ell", "ellipsoid", "hae", "wgs", "wgs84"}]
         msl = [k for k in candidates if set(self.named[k].tokens) & {"msl", "amsl", "geoid", "nn", "sea"}]
         if ell:
             self._set_aside(set(candidates) - {ell[0]})
-            return self._single(quantity), [("height_is", '"ellipsoid"', "by the column's name")]
+            return self._single(quantity, among=ell), [("height_is", '"ellipsoid"', "by the column's name")]
         if msl:
             self._set_aside(set(candidates) - {msl[0]})
-            return self._single(quantity), [("height_is", '"msl"', "by the column's name")]
-        return self._single(quantity), [("height_is", FILL_IN_TOML, '"ellipsoid" or "msl"')]
+            return self._single(quantity, among=msl), [("height_is", '"msl"', "by the column's name")]
+        found = self._single(quantity, among=candidates)
+        if found is not None and len(candidates) > 1:
+            others = ", ".join(f"'{self.table.names[k]}'" for k in candidates if self.table.names[k] != found.column)
+            found = replace(found, why=f"{found.why}; by its name or place the receiver's, not {others}")
+        return found, [("height_is", FILL_IN_TOML, '"ellipsoid" or "msl"')]
+
+    def _strangeness(self, k: int, beside: list[int]) -> tuple[bool, bool, int, int, bool]:
+        """How little a column has to do with the receiver's columns ``beside``: by words, then by place, behind first."""
+        own = {t for t in self.named[k].tokens if t.isalpha()} - QUANTITIES["alt"]
+        theirs = {t for at in beside for t in self.named[at].tokens} - QUANTITIES["lat"] - QUANTITIES["lon"]
+        away = min((abs(k - at) for at in beside), default=0)
+        return not own & _RECEIVER, bool(own & _OF_AIR), len(own ^ theirs), away, k < min(beside, default=0)
 
     def _set_aside(self, at: set[int]) -> None:
         self.spare |= at & self.free
@@ -578,6 +646,15 @@ def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:
         elif len(token) > 1 and token[-1] in "ned" and token[:-1] == "v":
             out.append((("v", *rest), "ned", AXES[token[-1]]))
     return out
+
+
+def _named_apart(found: list[SourceProposal]) -> list[SourceProposal]:
+    """Give trackers of one table names of their own, by which results go."""
+    trackers = [source for source in found if source.section.partition(".")[0] in _ENDINGS]
+    for source in trackers if len(trackers) > 1 else ():
+        group, _, name = source.section.partition(".")
+        source.section = f"{group}.{name[: 64 - len(_ENDINGS[group])]}{_ENDINGS[group]}"
+    return found
 
 
 def not_known(named: ColumnName) -> str:

@@ -615,6 +615,14 @@ def _not_recognised(table: FreeFormTable, file: str) -> Fault:
         without = _missing_of_a_radiosonde({q.short: m for q, m in recogniser.air_columns().items()}) or "three levels"
         words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
         return Fault(words, "sounding-incomplete")
+    if recogniser.time is None:
+        first = [(name, cells[0]) for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
+        shown = ", ".join(f"'{name}' {cell}" for name, cell in first)
+        words = (
+            f"{file}: no column of times is recognised, and without one nothing else is (the first row has {shown}); "
+            "docs/own-data.md lists the times that are read; or declare its columns in flight.toml"
+        )
+        return Fault(words, "not-recognised")
     words = f"{file}: nothing recognised among {', '.join(table.names)}; declare its columns in flight.toml"
     return Fault(words, "not-recognised")
 

@@ -268,6 +268,8 @@ def _time_lines(time: TimeProposal) -> list[str]:
         parts.append(f'format = "{time.format}"')
     elif time.unit != "s":
         parts.append(f'unit = "{time.unit or FILL_IN_VALUE}"')
+    if time.repeats:
+        parts.append('repeats = "first"')
     if time.offset_asked:
         parts.append(f"offset_s = {FILL_IN_TOML}")
     why = time.why

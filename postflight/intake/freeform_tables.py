@@ -133,6 +133,9 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     names = [n.strip() for n in header]
     units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
     rows = [_split(line, delimiter) for line in lines[first:] if not _is_comment(line, delimiter)]
+    if len(rows) > 3 and len(rows[-1]) < len(names) and all(len(row) >= len(names) for row in rows[:-1]):
+        notes.append(f"the last line is cut short ({len(rows[-1])} of {len(names)} cells) and left out")
+        lines, rows = lines[:-1], rows[:-1]
     if delimiter != ",":
         notes.append(f"delimiter {'spaces' if delimiter is None else repr(delimiter)} became a comma")
     if delimiter != "," and _decimal_comma(rows[:_HEAD_LINES]):
@@ -146,7 +149,8 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     for k, name in enumerate(names):
         if not name or names.index(name) != k:
             names[k] = f"{name or 'column'}_{k + 1}"
-            notes.append(f"column {k + 1} was named '{name}' like another: now '{names[k]}'")
+            was = f"was named '{name}' like another" if name else "had no name"
+            notes.append(f"column {k + 1} {was}: now '{names[k]}'")
     return FreeFormTable(label, names, units, rows, notes)
 
 
