@@ -73,12 +73,17 @@ def lateral_angles(velocity_body_mps: FloatArray) -> FloatArray:
 
 
 def angle_partials(velocity_body_mps: FloatArray) -> FloatArray:
-    """Derivatives ``(n, 2, 3)`` of the lateral angles by the velocity (n, 3), to first order in the angle."""
-    u = velocity_body_mps[:, 0]
+    """Derivatives ``(n, 2, 3)`` of the lateral angles by the velocity (n, 3), to first order; NaN at rest."""
+    u = _or_nan(velocity_body_mps[:, 0])
     out = np.zeros((len(u), 2, 3))
     out[:, 0, 1] = out[:, 1, 2] = 1.0 / u
     out[:, :, 0] = -velocity_body_mps[:, 1:] / u[:, None] ** 2
     return out
+
+
+def _or_nan(divisor: FloatArray) -> FloatArray:
+    """NaN where it is zero: of what stands still a direction is not known."""
+    return np.where(divisor == 0.0, np.nan, divisor)
 
 
 def pressure_pulse(dynamic_pressure_pa: FloatArray) -> BoolArray:
@@ -147,7 +152,7 @@ class _Flow:
 
     @property
     def beta_rad(self) -> FloatArray:
-        return np.arcsin(np.clip(self.body_mps["wind"][:, 1] / self.airspeed_mps, -1.0, 1.0))
+        return np.arcsin(np.clip(self.body_mps["wind"][:, 1] / _or_nan(self.airspeed_mps), -1.0, 1.0))
 
 
 def _flow(inputs: Inputs, profile: AtmosphereProfile, arm_body_m: FloatArray) -> _Flow:
@@ -205,6 +210,8 @@ def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: Flo
     sd = {name: _total_sd(flow.body_mps[name], cov[name]) for name in VELOCITIES}
     speed_var = _speed_var(trajectory, flow.point_ecef_mps["wind"], speed) + wind_var
     v_ned = np.einsum("nij,nj->ni", flow.dcm_ned_ecef, flow.point_ecef_mps["ground"])
+    with np.errstate(divide="ignore", invalid="ignore"):  # at rest
+        pressure_sd = np.sqrt(air.density_sd**2 + 4.0 * speed_var / speed**2)
     return AirData(
         time_s=trajectory.time_s,
         altitude_m=flow.altitude_m,
@@ -215,7 +222,7 @@ def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: Flo
         airspeed_mps=speed,
         mach=flow.mach,
         dynamic_pressure_pa=pressure,
-        dynamic_pressure_sd_pa=pressure * np.sqrt(air.density_sd**2 + 4.0 * speed_var / speed**2),
+        dynamic_pressure_sd_pa=pressure * pressure_sd,
         alpha_rad=flow.alpha_rad,
         beta_rad=flow.beta_rad,
         alpha_total_wind_rad=total["wind"],
@@ -240,7 +247,7 @@ def _lateral_cov(
     """
     if trajectory.covariance is None:
         return np.full((len(v_body), 2, 2), np.nan)
-    u = v_body[:, 0]
+    u = _or_nan(v_body[:, 0])
     to_angle = angle_partials(v_body)
     jacobian = np.concatenate([to_angle @ dcm_ecef_body.transpose(0, 2, 1), to_angle @ rotations.skew(v_body)], axis=2)
     cov = jacobian @ trajectory.covariance[:, 3:, 3:] @ jacobian.transpose(0, 2, 1)
@@ -258,7 +265,7 @@ def _total_sd(v_body: FloatArray, cov: FloatArray) -> FloatArray:
 def _speed_var(trajectory: Trajectory, v_air: FloatArray, speed: FloatArray) -> FloatArray:
     if trajectory.covariance is None:
         return np.full(len(speed), np.nan)
-    unit = v_air / speed[:, None]
+    unit = v_air / _or_nan(speed)[:, None]
     return np.einsum("ni,nij,nj->n", unit, trajectory.covariance[:, 3:6, 3:6], unit)
 
 

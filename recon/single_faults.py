@@ -95,7 +95,7 @@ def log_likelihood(problem: Problem, run: ForwardPass) -> tuple[float, float]:
         return -np.inf, np.inf
     size = np.minimum(nis, problem.gate[count])
     _, log_det = np.linalg.slogdet(covariance)  # components that were not measured have unit variance there
-    return float(-0.5 * (size + log_det).sum()), float(size.sum() / count.sum())
+    return float(-0.5 * (size + log_det).sum()), float(size.sum() / max(count.sum(), 1))
 
 
 def with_noise(problem: Problem, noisier: dict[str, float]) -> Problem:

@@ -571,7 +571,7 @@ class Recogniser:
         return found, [("height_is", FILL_IN_TOML, '"ellipsoid" or "msl"')]
 
     def _strangeness(self, k: int, beside: list[int]) -> tuple[bool, bool, int, int, bool]:
-        """How little a column has to do with the receiver's columns ``beside``: by words, then by place, behind first."""
+        """How little a column has to do with those ``beside`` it: by words, then by place, behind them first."""
         own = {t for t in self.named[k].tokens if t.isalpha()} - QUANTITIES["alt"]
         theirs = {t for at in beside for t in self.named[at].tokens} - QUANTITIES["lat"] - QUANTITIES["lon"]
         away = min((abs(k - at) for at in beside), default=0)

@@ -68,7 +68,8 @@ def draw_trajectory(flight: Reconstruction, folder: Path) -> None:
     if flight.attitude is not None and flight.attitude.comparison is not None:
         draw(folder / "attitude_check.png", figure_attitude, flight, flight.attitude)
     draw(folder / "filter_and_smoother.png", figure_filter_and_smoother, flight)
-    if len(flight.solution.residuals):  # an entry state and inertial sensors have none
+    residuals = flight.solution.residuals
+    if len(residuals) and residuals["used"].any():  # an entry state and inertial sensors have none
         draw(folder / "residuals.png", figure_residuals, flight)
     if flight.loads is not None:
         _draw_static_trim(flight.loads, flight.flight, folder)

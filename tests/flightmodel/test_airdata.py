@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -60,6 +62,15 @@ def test_point_that_meets_the_air_moves_with_the_rotation():
         - air_data(path, profile(), np.zeros(3)).velocity_air_body_mps
     )
     np.testing.assert_allclose(moved, np.cross(path.omega_body_eci_body_radps, arm), atol=2e-4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_what_stands_still_in_still_air_angles_have_no_sd():
+    path = trajectory(np.tile(np.eye(9), (3, 1, 1)))
+    still = replace(path, velocity_ecef_mps=np.array([[0.0] * 3, [1.0] * 3, [1.0] * 3]))
+    air = air_data(still, replace(profile(), wind_ned_mps=np.zeros((2, 3))), np.zeros(3))
+    for sd in (air.alpha_total_wind_sd_rad, air.alpha_total_ground_sd_rad, air.dynamic_pressure_sd_pa, air.beta_rad):
+        np.testing.assert_array_equal(np.isfinite(sd), [False, True, True])
 
 
 def test_standard_deviations_equal_a_monte_carlo():

@@ -14,6 +14,7 @@ from flightmodel.trajectory import difference
 from postflight import plots
 from postflight.flight import Flight
 from postflight.plots import style
+from postflight.plots.run_figures import draw_trajectory
 from postflight.plots.style import in_style, save
 from postflight.plots.trajectory import (
     figure_attitude,
@@ -91,6 +92,11 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
     drawn(figure, tmp_path / "filter.png")
     assert len(figure.get_axes()) == 4
     drawn(figure_residuals(ballistic), tmp_path / "residuals.png")
+    # of trackers that are all left out there are no residuals to draw
+    alone = replace(ballistic.solution, residuals=ballistic.solution.residuals.assign(used=False))
+    (tmp_path / "without").mkdir()
+    draw_trajectory(replace(ballistic, solution=alone), tmp_path / "without")
+    assert {path.name for path in (tmp_path / "without").iterdir()} == {"flown.png", "filter_and_smoother.png"}
     found = sensitivity(ballistic)
     assert not found.quantity.astype(str).str.contains("rotation|attack").any()
     assert (found[(found.rerun == "mass +1 %") & (found.quantity == "altitude")].change != 0.0).all()
