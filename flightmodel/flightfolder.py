@@ -47,6 +47,7 @@ from flightmodel.entry_state import DragEntry, StateEntry, read_drag
 from flightmodel.files import open_file
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
+from flightmodel.input_findings import input_findings
 from flightmodel.instruments import (
     SITES,
     AtmosphereEntry,
@@ -474,6 +475,9 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     }
     films = _films(gate, spec, vehicle)
     prior = _attitude_prior(gate, spec.attitude_prior, place) if spec.attitude_prior else None
+    if spec.motion.model == "strapdown":
+        most_g = {name: entry.most_g for name, entry in spec.gnss.items()}
+        gate.findings.extend(input_findings(triads.get("accelerometer"), gnss, prior, most_g))
     return Sources(
         gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior, drag, state
     )

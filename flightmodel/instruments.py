@@ -727,6 +727,7 @@ class GnssEntry(Heights):
     """A satellite navigation receiver: its table, antenna, errors, and which fixes are good enough.
 
     ``axes`` are those of positions x, y, z and of their velocities: planet-fixed ones, these at t0, or J2000 (Mars).
+    ``most_g`` is the acceleration that it can follow, by its data sheet.
     """
 
     antenna_from_datum_body_m: tuple[Place, Place, Place] = (0.0, 0.0, 0.0)
@@ -736,6 +737,7 @@ class GnssEntry(Heights):
     satellites_column: str = "nsat"
     min_fix_mode: Annotated[int, Field(ge=1, le=9)] | None = None
     fix_mode_column: str = "fix_mode"
+    most_g: Annotated[float, Field(ge=1.0, le=1e4)] = 4.0
 
     @property
     def components(self) -> tuple[str, ...]:
