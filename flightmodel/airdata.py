@@ -25,6 +25,7 @@ from flightmodel.trajectory import Trajectory
 
 VELOCITIES = ("inertial", "ground", "wind")
 ANGLES = ("latitude", "longitude", "roll", "pitch", "yaw", "alpha", "beta")
+_STEP_M = 1000.0  # over which air is linear enough: an eighth of its scale height
 
 
 @dataclass(frozen=True)
@@ -327,6 +328,8 @@ def derived_with_sd(
     air = profile.at(value["altitude"])
     root: FloatArray = np.asarray(np.linalg.cholesky(trajectory.covariance + 1e-18 * np.eye(9)), dtype=np.float64)
     warm = profile.temperature_sd(value["altitude"])
+    # derivatives are taken over one sd, of very unsure positions over a part of it: they stay where there is air
+    share = np.minimum(1.0, _STEP_M / np.linalg.norm(root[:, :3, :3], axis=(1, 2)))
 
     def with_path(path: Trajectory) -> FloatArray | float:
         if profile.met_m is None:
@@ -337,7 +340,7 @@ def derived_with_sd(
 
     def moved(k: int, sign: float) -> dict[str, FloatArray]:
         if k < 9:
-            step = sign * root[:, :, k]
+            step = sign * share[:, None] * root[:, :, k]
             path = replace(
                 trajectory,
                 position_ecef_m=trajectory.position_ecef_m + step[:, 0:3],
@@ -360,5 +363,6 @@ def derived_with_sd(
             gap = up[name] - down[name]
             if is_angle(name):
                 gap = np.mod(gap + np.pi, 2.0 * np.pi) - np.pi
+            gap = gap / share if k < 9 else gap
             variance[name] += (0.5 * gap) ** 2
     return value, {name: np.sqrt(v) for name, v in variance.items()}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import air_data, lateral_angles, pressure_pulse, total_angle
+from flightmodel.airdata import air_data, derived_with_sd, lateral_angles, pressure_pulse, total_angle
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.deflection import lv_clock
 from flightmodel.events import find_peak
@@ -96,6 +96,17 @@ def test_standard_deviations_equal_a_monte_carlo():
     # 4000 draws: 1 sd of a sample variance is 2.2 %; the horizontal wind is modelled as if it blew along any axis,
     # which a vehicle descending at 75 deg makes right to cos^2 of its incidence
     np.testing.assert_allclose(np.sqrt(np.diag(measured)), np.sqrt(np.diagonal(air.lateral_flow_cov[0])), rtol=0.09)
+
+
+def test_standard_deviations_of_a_place_that_is_hardly_known_are_linear():
+    # one sd below the trajectory there is neither air nor ground; small errors elsewhere keep theirs
+    small = np.diag([300.0**2] * 3 + [0.4**2] * 3 + [0.001**2] * 3)
+    wide = small.copy()
+    wide[:3, :3] *= 200.0**2
+    _, known = derived_with_sd(trajectory(np.tile(small, (3, 1, 1))), profile(), np.zeros(3))
+    _, unknown = derived_with_sd(trajectory(np.tile(wide, (3, 1, 1))), profile(), np.zeros(3))
+    np.testing.assert_allclose(unknown["altitude"], 200.0 * known["altitude"], rtol=0.01)
+    np.testing.assert_allclose(unknown["speed_ground"], known["speed_ground"], rtol=0.01)
 
 
 def test_peak_and_pulse():
