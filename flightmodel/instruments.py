@@ -701,20 +701,29 @@ class SitesEntry(Section):
 
 
 class Heights(TrackingSource):
-    """A table with heights: above what, and by how much the two surfaces differ."""
+    """A table with heights: above what, and by how much the two surfaces differ.
 
-    height_is: Literal["ellipsoid", "msl"] | None = None
+    Those of altimeters for sport rockets and drones are above the ground that they started from: ``ground_height_m``.
+    """
+
+    height_is: Literal["ellipsoid", "msl", "ground"] | None = None
     geoid_undulation_m: Undulation | None = None
+    ground_height_m: Annotated[float, Field(ge=-1000.0, le=9000.0)] | None = None
 
     @model_validator(mode="after")
     def _undulation_meant(self) -> Heights:
         if self.height_is != "msl" and self.geoid_undulation_m is not None:
             words = 'is used only with height_is = "msl"; say that, or remove it'
             raise KeyFaults([("geoid_undulation_m", self.geoid_undulation_m, words)])
+        if (self.height_is == "ground") != (self.ground_height_m is not None):
+            words = 'and height_is = "ground" need each other: m above the ellipsoid, where heights are zero'
+            raise KeyFaults([("ground_height_m", self.ground_height_m, words)])
         return self
 
     def to_ellipsoid_m(self, latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
-        """What is added to heights of the table at places (...,), m: the stated undulation, else EGM96's."""
+        """What is added to heights of the table at places (...,), m: the ground's, the stated geoid's, or EGM96's."""
+        if self.height_is == "ground":
+            return np.full(np.shape(latitude_rad), self.ground_height_m)
         if self.height_is != "msl":
             return np.zeros(np.shape(latitude_rad))
         if self.geoid_undulation_m is not None:

@@ -376,8 +376,12 @@ def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | N
             f"{table.label}: {words} in {table.label}.columns, as height or as pressure", "columns-ambiguous"
         )
     if form is not None and source.height_is is None:
-        words = 'say height_is = "ellipsoid" or height_is = "msl" (pressures too)'
+        words = 'say height_is = "ellipsoid" or "msl" (pressures too), or "ground" with ground_height_m'
         gate.refuse_config(f"{table.label}: heights above what? {words}", "height-datum")
+        return None
+    if form == "pressure" and source.height_is == "ground":
+        words = 'pressures are not above the ground: say height_is = "msl", and take ground_height_m out'
+        gate.refuse_config(f"{table.label}: {words}", "height-datum")
         return None
     return form
 

@@ -590,6 +590,8 @@ class Recogniser:
         if found is None:
             return []
         what = '"ellipsoid" or "msl"; pressures too'
+        if found.short == height.short:
+            what = '"ellipsoid" or "msl"; an altimeter that starts at 0: "ground", and ground_height_m'
         return [SourceProposal(f"barometers.{self.name}", [found], [("height_is", FILL_IN_TOML, what)])]
 
     def air_columns(self) -> dict[Quantity, ColumnProposal]:

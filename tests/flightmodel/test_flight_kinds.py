@@ -172,6 +172,17 @@ def test_noise_of_its_own_for_each_fix(folder):
     folder.refused([GNSS, BALLISTIC], "value-range", "horizontal_sd", kind=GateError)
 
 
+def test_heights_above_the_ground_start_from_its_own(folder):
+    folder.table("baro.csv", "t_s,height_m", T, 10.0 * T)
+    baro = '[barometers.baro]\nfile = "baro.csv"\nheight_is = "ground"\n'
+    telemetry = folder.read(GNSS, baro + "ground_height_m = 1400.0\n", BALLISTIC)
+    np.testing.assert_allclose(telemetry.barometers["baro"].height_m, 1400.0 + 10.0 * T)
+    folder.refused([GNSS, baro, BALLISTIC], "keys-conflict", "ground_height_m")
+    folder.refused([GNSS, BARO + "ground_height_m = 1400.0\n", BALLISTIC], "keys-conflict", "ground_height_m")
+    folder.table("baro.csv", "t_s,pressure_pa", T, 9e4 - 100.0 * T)
+    folder.refused([GNSS, baro + "ground_height_m = 1400.0\n", BALLISTIC], "height-datum", "pressures")
+
+
 def test_weak_fixes_are_left_out_and_counted(folder):
     nsat = np.where(T < 5.0, 5, 9)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,sats", T, LAT + 0 * T, LON + 0 * T, 1400 + T, nsat)
