@@ -253,6 +253,26 @@ def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings
     return out
 
 
+def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+    """Say which trackers, left out by the settings, are not where the others predict them: either may be wrong."""
+    found = []
+    owners = {instrument.name: instrument.owner for instrument in problem.instruments}
+    gate = settings.gate_probability
+    for source, rows in held_out.groupby("source", sort=False):
+        far = beyond_gate(rows, gate).droplevel("source")
+        if owners[str(source)] not in settings.without or far.mean() <= _MOST_EDITED:
+            continue
+        times = far.index[far]
+        worst = (rows.residual / rows.predicted_sd).abs().idxmax()
+        words = (
+            f"left out, and {len(times)} of its {len(far)} points lie farther off than predicted, up to "
+            f"{abs(rows.residual[worst]) / rows.predicted_sd[worst]:.1f} sd at {rows.time_s[worst]:.1f} s: it "
+            "disagrees with the trajectory, and either may be wrong"
+        )
+        found.append(Finding(str(source), words, float(times.min()), float(times.max()), "left-out-disagrees"))
+    return found
+
+
 def _settled_from_s(problem: Problem) -> float:
     """Time from which on points are tested: the start was fitted to those before; of a short span, the later half."""
     first, last = float(problem.time_s[0]), float(problem.time_s[-1])

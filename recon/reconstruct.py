@@ -395,6 +395,7 @@ def reconstruct_once(
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
     edits = consistency.edit_findings(problem, run.innovations.accepted)
+    edits += consistency.left_out_findings(problem, held_out, settings)
     about = run.charts
     del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:

@@ -10,11 +10,13 @@ from recon.consistency import (
     data_sheet_check,
     edit_check,
     held_out_checks,
+    left_out_findings,
     mcreynolds_checks,
     nis_check,
     whiteness_check,
 )
 from recon.settings import Settings
+from tests.refusing import numbers_in
 
 DRAWS = 4000
 
@@ -139,4 +141,11 @@ def test_held_out_points_beyond_the_gate_turn_the_check_red():
     assert not far.passed
     assert (far.code, far.source, far.value) == ("held-out", "gps", pytest.approx(3 / 40))
     assert held_out_checks(problem, table, Settings(hold_out_every=2, without=("gps",))) == []
+    # of a tracker that is left out altogether a finding says it
+    (finding,) = left_out_findings(problem, table, Settings(without=("gps",)))
+    assert (finding.code, finding.source, finding.start_s, finding.end_s) == (
+        "left-out-disagrees", "gps velocity", 0.0, 2.0,
+    )  # fmt: skip
+    assert numbers_in(finding.what) == [3.0, 40.0, 6.0, 0.0]
+    assert left_out_findings(problem, table, Settings(hold_out_every=2)) == []
     assert held_out_checks(problem, table, Settings()) == []
