@@ -589,7 +589,9 @@ class Mounted(Source):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
                 faults.append(("axes", list(self.axes), Fault(words, "axes-parallel")))
             elif np.linalg.det(dcm) < 0.0:
-                words = "these axes are left-handed (a mirror image); change one of the signs or swap two axes"
+                words = (
+                    "left-handed axes (a mirror image): change a sign, swap two, or give one column a unit as -degps"
+                )
                 faults.append(("axes", list(self.axes), Fault(words, "axes-left-handed")))
         elif self.position_from_datum_body_m is not None and self.mount != "body":
             words = 'goes with axes = ["+x", "+y", "+z"] or mount = "body"; a package of the vehicle has its own place'

@@ -59,6 +59,7 @@ class Unit(NamedTuple):
     offset: float = 0.0
 
 
+_ALONG_AXES = {"acceleration", "rate", "magnetic field"}
 UNITS: dict[str, Unit] = {
     "s": Unit("time", 1.0),
     "ms": Unit("time", 1e-3),
@@ -140,7 +141,13 @@ _KINDS = {
 
 
 def read_unit(text: str) -> Unit | None:
-    """Unit by its short name, or as the library reads it; None where it is no unit of a quantity of a table."""
+    """Unit by its short name, or as the library reads it; None where it is no unit of a quantity of a table.
+
+    ``-degps`` is of a sensor's axis that points the other way than its name says: mirrored triads have no other words.
+    """
+    if text.startswith("-") and text[1:2].isalpha():
+        along = read_unit(text[1:])
+        return along._replace(factor=-along.factor) if along is not None and along.kind in _ALONG_AXES else None
     return UNITS.get(text) or _read(text)
 
 

@@ -143,7 +143,8 @@ class ColumnName:
         key = unit_key(self.unit_text)
         if key in UNIT_SPELLINGS or not key or key in SEVERAL_MEANINGS:
             return UNIT_SPELLINGS.get(key, ())
-        return (self.unit_text,) if read_unit(self.unit_text) is not None else ()
+        known = not self.unit_text.startswith("-") and read_unit(self.unit_text) is not None
+        return (self.unit_text,) if known else ()
 
     def units(self, kind: str) -> list[str]:
         """Return the stated unit's names in flight.toml that fit a kind of quantity; empty where none does."""

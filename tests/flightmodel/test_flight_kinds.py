@@ -183,6 +183,14 @@ def test_heights_above_the_ground_start_from_its_own(folder):
     folder.refused([GNSS, baro + "ground_height_m = 1400.0\n", BALLISTIC], "height-datum", "pressures")
 
 
+def test_a_unit_with_a_minus_turns_one_axis_round(folder):
+    plain = folder.read(GNSS, TRIADS, PRIOR).rates.measured_sensor
+    turned = folder.read(GNSS, TRIADS.replace('"wy", unit = "degps"', '"wy", unit = "-degps"'), PRIOR).rates
+    np.testing.assert_array_equal(turned.measured_sensor, plain * [1.0, -1.0, 1.0])
+    minus = '[gnss.gps.columns]\nalt = { column = "alt_m", unit = "-m" }\n'
+    folder.refused([GNSS + minus, BALLISTIC], "key-value", "'-m'")
+
+
 def test_weak_fixes_are_left_out_and_counted(folder):
     nsat = np.where(T < 5.0, 5, 9)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,sats", T, LAT + 0 * T, LON + 0 * T, 1400 + T, nsat)
