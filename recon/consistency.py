@@ -486,6 +486,11 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     )
 
 
+def point_findings(problem: Problem, accepted: BoolArray, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+    """Findings on measurements that were edited, and on trackers that are left out."""
+    return edit_findings(problem, accepted) + left_out_findings(problem, held_out, settings)
+
+
 def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
     """Stretches in which measurements were edited; sources excluded by settings have none."""
     out = []

@@ -394,8 +394,7 @@ def reconstruct_once(
     checks += survey.place_checks(missed, settings.check_confidence, tracked)
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
     residuals = consistency.residual_table(problem, run.innovations)
-    edits = consistency.edit_findings(problem, run.innovations.accepted)
-    edits += consistency.left_out_findings(problem, held_out, settings)
+    edits = consistency.point_findings(problem, run.innovations.accepted, held_out, settings)
     about = run.charts
     del run  # as large as all that follows together
     if sensors is not None and adaptation.lag is None:
