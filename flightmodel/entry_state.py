@@ -24,7 +24,7 @@ from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import Angle, Elevation, KeyFaults, Latitude, Longitude, Section, Time
 from flightmodel.gate import Gate
 from flightmodel.tables import Source
-from flightmodel.telemetry import Finding, StatedDrag, StatePrior
+from flightmodel.telemetry import Finding, StatedDrag, StatePrior, TriadRecord
 
 Axes = Literal["fixed", "inertial", "j2000"]
 Triple = tuple[float, float, float]
@@ -32,6 +32,8 @@ Size = Annotated[float, Field(gt=0.0, le=1e8)]
 Percent = Annotated[float, Field(ge=0.0, le=300.0)]
 _LOWEST_M, _HIGHEST_M = -1e4, 1e6  # Hellas; beyond the atmospheres' tables
 _SUPERSONIC, _MOST_C_A = 2.0, 2.0  # Newtonian flow: 2 sin^2 of a plate across it; behind a normal shock it is less
+_MOST_AWAY_S = 86400.0  # of an entry's readings from its state: a day
+_FELT = 50.0  # times noise and bias, from which a reading is a force
 _CARTESIAN = ("position_m", "velocity_mps")
 _SPHERICAL = ("latitude_deg", "longitude_deg", "speed_mps", "flight_path_deg", "azimuth_deg")
 
@@ -226,3 +228,28 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
     assert area is not None
     sd = 0.01 * float(np.hypot(entry.c_a_sd_percent, entry.mass_sd_percent))
     return StatedDrag(mach, c_a, float(area), entry.mass_kg, sd)
+
+
+def refuse_misread_entry(gate: Gate, record: TriadRecord, state: StatePrior) -> None:
+    """Refuse a deceleration that counts positive along body x, and times that are days from the entry's state.
+
+    A drag pushes nowhere forward: of a sign that is wrong the reconstruction diverges, or rejects every reading.
+    """
+    name = record.spec.name
+    away = max(record.time_s[0] - state.time_s, state.time_s - record.time_s[-1])
+    if away > _MOST_AWAY_S:
+        gate.refuse(
+            f"{name}: readings from {record.time_s[0]:.6g} to {record.time_s[-1]:.6g} s, the state is of "
+            f"{state.time_s:.6g} s: all times count from t0_utc; state offset_s of a spacecraft's clock, or its unit",
+            "times-apart",
+        )
+    axial = record.spec.dcm_body_sensor[0]
+    used = np.abs(axial) > 1e-9
+    reading = record.measured_sensor[:, used] @ axial[used]
+    felt = reading[np.abs(reading) > _FELT * max(record.spec.noise_sd, record.spec.bias_sd)]
+    if len(felt) and np.median(felt) > 0.0:
+        gate.refuse(
+            f"{name}: along body x it reads {np.median(felt):+.2g} m/s2 in the middle of what it feels, and a drag "
+            'reads negative: where the file counts a deceleration positive, state axes = ["-x", "+y", "-z"]',
+            "deceleration-sign",
+        )

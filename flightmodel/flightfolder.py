@@ -43,7 +43,7 @@ from flightmodel.earth import (
     geodetic_from_ecef,
     q_ecef_body_from_pointing,
 )
-from flightmodel.entry_state import DragEntry, StateEntry, read_drag
+from flightmodel.entry_state import DragEntry, StateEntry, read_drag, refuse_misread_entry
 from flightmodel.files import open_file
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
@@ -70,7 +70,6 @@ from flightmodel.sensor_tables import (
     read_sounding,
     read_sun,
     read_triad,
-    refuse_misread_entry,
     with_least_count,
 )
 from flightmodel.tables import GNSS_SD, Source, Spans

@@ -63,7 +63,6 @@ from flightmodel.telemetry import (
     GnssRecord,
     RadarRecord,
     Sounding,
-    StatePrior,
     SunRecord,
     TriadRecord,
 )
@@ -622,8 +621,6 @@ WANTED_RATE_HZ = 1000.0  # a sine of 100 Hz, beyond structure and joint, loses 1
 STEADY = 0.99  # part of the steps that must be the usual one within a fifth
 WHOLE = 0.75  # part of a block's samples that its mean needs
 # of readings in whole counts: fewer show no pattern; more values than half the samples are no counts beyond noise
-_MOST_AWAY_S = 86400.0  # of an entry's readings from its state: a day
-_FELT = 50.0  # times noise and bias, from which a reading is a force
 _LEAST_LEVELS, _MOST_LEVELS = 5, 0.5
 
 
@@ -662,31 +659,6 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     words = f"readings are multiples of {step:.3g} (SI), more than noise and resolution state: taken for resolution"
     finding = Finding(record.spec.name, words, np.nan, np.nan, code="least-count")
     return replace(record, spec=replace(record.spec, resolution=step)), [finding]
-
-
-def refuse_misread_entry(gate: Gate, record: TriadRecord, state: StatePrior) -> None:
-    """Refuse a deceleration that counts positive along body x, and times that are days from the entry's state.
-
-    A drag pushes nowhere forward: of a sign that is wrong the reconstruction diverges, or rejects every reading.
-    """
-    name = record.spec.name
-    away = max(record.time_s[0] - state.time_s, state.time_s - record.time_s[-1])
-    if away > _MOST_AWAY_S:
-        gate.refuse(
-            f"{name}: readings from {record.time_s[0]:.6g} to {record.time_s[-1]:.6g} s, the state is of "
-            f"{state.time_s:.6g} s: all times count from t0_utc; state offset_s of a spacecraft's clock, or its unit",
-            "times-apart",
-        )
-    axial = record.spec.dcm_body_sensor[0]
-    used = np.abs(axial) > 1e-9
-    reading = record.measured_sensor[:, used] @ axial[used]
-    felt = reading[np.abs(reading) > _FELT * max(record.spec.noise_sd, record.spec.bias_sd)]
-    if len(felt) and np.median(felt) > 0.0:
-        gate.refuse(
-            f"{name}: along body x it reads {np.median(felt):+.2g} m/s2 in the middle of what it feels, and a drag "
-            'reads negative: where the file counts a deceleration positive, state axes = ["-x", "+y", "-z"]',
-            "deceleration-sign",
-        )
 
 
 def _least_count(column: FloatArray) -> float:

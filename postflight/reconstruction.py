@@ -43,6 +43,7 @@ from postflight.flight import Flight
 from postflight.streams import on_one_thread
 from recon.atmosphere import (
     HALF_WINDOW_S,
+    LARGEST_GAP_S,
     LEAST_AXIAL_MPS2,
     ReconstructedAir,
     as_flown_atmosphere,
@@ -373,11 +374,14 @@ def bet_table(flight: Reconstruction) -> pd.DataFrame:
     columns |= _vector("r{}_ecef_m", "xyz", bet.position_ecef_m)
     columns |= _vector("v{}_ecef_mps", "xyz", bet.velocity_ecef_mps)
     columns |= _vector("q{}_ecef_body", "wxyz", bet.q_ecef_body)
-    columns |= _vector("{}_body_degps", "pqr", np.rad2deg(bet.omega_body_eci_body_radps))
+    rate_sd = _rate_sd(flight)
+    bridged = np.isnan(rate_sd) & bool(len(flight.solution.rate_cov))
+    rate = np.where(bridged, np.nan, bet.omega_body_eci_body_radps)
+    columns |= _vector("{}_body_degps", "pqr", np.rad2deg(rate))
     columns |= _vector("r{}_ecef_sd_m", "xyz", sd[:, 0:3])
     columns |= _vector("v{}_ecef_sd_mps", "xyz", sd[:, 3:6])
     columns |= _vector("rotation_{}_body_sd_deg", "xyz", np.rad2deg(sd[:, 6:9]))
-    columns |= _vector("{}_body_sd_degps", "pqr", np.rad2deg(_rate_sd(flight)))
+    columns |= _vector("{}_body_sd_degps", "pqr", np.rad2deg(rate_sd))
     columns |= _inertial(flight)
     columns |= _derived(flight)
     columns |= _force(flight)
@@ -389,11 +393,16 @@ def bet_table(flight: Reconstruction) -> pd.DataFrame:
 
 
 def _rate_sd(flight: Reconstruction) -> FloatArray:
-    """Standard deviations (n, 3) of the rates: estimated errors and a sample's white noise."""
+    """Standard deviations (n, 3) of the rates, by estimated errors and white noise; NaN where none is measured."""
     bet, rates = flight.solution, flight.telemetry.rates
     if not len(bet.rate_cov) or rates is None:
         return np.full((len(bet.smoothed.time_s), 3), np.nan)
-    return np.asarray(np.sqrt(np.diagonal(bet.rate_cov, axis1=1, axis2=2) + rates.spec.noise_sd**2))
+    sd = np.sqrt(np.diagonal(bet.rate_cov, axis1=1, axis2=2) + rates.spec.noise_sd**2)
+    time_s = bet.smoothed.time_s
+    for gap in bet.findings:
+        if gap.code == "gap-bridged" and gap.source == rates.spec.name and gap.end_s - gap.start_s > LARGEST_GAP_S:
+            sd[(time_s > gap.start_s) & (time_s < gap.end_s)] = np.nan
+    return np.asarray(sd)
 
 
 def _inertial(flight: Reconstruction) -> Columns:
