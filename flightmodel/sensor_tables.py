@@ -519,11 +519,12 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
         used, findings = rows_to_use(label, source, time_s)
         gate.findings.extend(findings)
         time_s = time_s[used]
+    before = len(gate.faults)
     if source.film is None:
         paths, numbers = _image_paths(gate, images, table, used, path, camera, label), None
     else:
         paths, numbers = (images,), _film_numbers(gate, images, table, used, path, camera, label)
-    if time_s is None:
+    if time_s is None or len(gate.faults) > before:
         return None
     if not len(time_s):
         gate.refuse(f"{label}: {path}: use_s leaves no frame", "use-span-empty")

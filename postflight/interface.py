@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import GateError, Progress
+from flightmodel.checks import ConfigError, GateError, Progress
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.checks.folder_check import Report, check_folder
@@ -118,6 +118,9 @@ def monte_carlo(
     GateError
         The folder holds another study.
     """
+    for name, value in (("flights", flights), ("workers", workers)):
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+            raise ConfigError(f"{name} = {value!r}: a whole number from 1 is wanted", code="option-value")
     study, folder = read_study(str(dispersions)), Path(folder)
     wanted = execution.Wanted(flights or study.spec.flights, workers or available_cores(), None, study.spec.stop)
     count = execution.run(study, folder, wanted, progress or (lambda _fraction, _what: None))

@@ -72,6 +72,7 @@ _ENDINGS = {"radars": "_radar", "gnss": "_gnss", "barometers": "_baro"}
 _MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 _AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
 _AIR_BY_COMPONENTS = ("wind_north", "wind_east")
+_OF_COMPONENTS = {"n", "e", "u", "v", "north", "east", "northward", "eastward"}
 _RECEIVER = {"gps", "gnss", "hae", "ellipsoid"}  # in the name of a height
 _OF_AIR = {"baro", "barometer", "barometric", "pressure", "press", "qnh"}
 _Family = tuple[tuple[str, ...], str]
@@ -436,8 +437,8 @@ class Recogniser:
         words = QUANTITIES[short]
         tokens = {k: self.named[k].tokens for k in sorted(self.free)}
         found = [k for k, own in tokens.items() if matching(own, words) or "".join(own) in words]
-        if short == "wind_speed":  # "wind from" is no speed
-            found = [k for k in found if not set(tokens[k]) & QUANTITIES["wind_from"]]
+        if short == "wind_speed":  # "wind from" is no speed, "wind north" none of the whole wind
+            found = [k for k in found if not set(tokens[k]) & (QUANTITIES["wind_from"] | _OF_COMPONENTS)]
         return sorted(found, key=lambda k: (len(set(tokens[k]) - words), k))
 
     def _single(

@@ -97,8 +97,8 @@ QUANTITIES = _vocabulary(
         "rho": "rho density dichte dens luftdichte",
         "wind_speed": "windspeed wspd ff sknt windgeschwindigkeit smps wind speed spd",
         "wind_from": "winddir wdir dd drct windrichtung from wd direction dir",
-        "wind_north": "windn v vgrd meridional ncomp",
-        "wind_east": "winde u ugrd zonal ecomp",
+        "wind_north": "windn v vgrd meridional ncomp north northward",
+        "wind_east": "winde u ugrd zonal ecomp east eastward",
         "nsat": "nsat sats satellites satelliten numsv nsats sat",
     }
 )

@@ -16,7 +16,18 @@ from postflight.deflections import Deflections
 from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import fit_height, trajectory_angle, window
-from postflight.plots.style import COLOUR, LABEL, STROKE, TIME, WIDE_BAND, band, in_style, legend_above, stamp
+from postflight.plots.style import (
+    COLOUR,
+    LABEL,
+    STROKE,
+    TIME,
+    WIDE_BAND,
+    band,
+    in_style,
+    legend_above,
+    stamp,
+    with_holes,
+)
 from postflight.reconstruction import Reconstruction
 
 _MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
@@ -78,11 +89,11 @@ def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray
         frames = answers.histories["camera"]
         ax.plot(frames.time_s, np.rad2deg(frames.theta_rad), ".", color=COLOUR["camera"], ms=3, label="_frames")
     for method, history in answers.continuous.items():
-        theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
+        t, (theta, sd) = with_holes(history.time_s, [np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)])
         mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
         style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
-        ax.plot(history.time_s, theta, label=LABEL[method], **style)
-        band(ax, history.time_s, theta, sd, COLOUR[method], alpha=WIDE_BAND)
+        ax.plot(t, theta, label=LABEL[method], **style)
+        band(ax, t, theta, sd, COLOUR[method], alpha=WIDE_BAND)
     if truth is not None:
         ax.plot(*truth, color=COLOUR["truth"], lw=0.8, label="truth (synthetic)")
 
@@ -101,8 +112,9 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
         (angle, theta, sd, "deflection (deg)", None),
         (plane, clock, plane_sd, "plane (deg LV), where deflection > its sd", 360.0),
     ):
-        ax.plot(history.time_s, values, color=COLOUR["fused"], label="fused")
-        band(ax, history.time_s, values, spread, COLOUR["fused"], label="1 sd")
+        t, (drawn, sd_drawn) = with_holes(history.time_s, [values, spread])
+        ax.plot(t, drawn, color=COLOUR["fused"], label="fused")
+        band(ax, t, drawn, sd_drawn, COLOUR["fused"], label="1 sd")
         ax.set(ylabel=label, xlabel=TIME, ylim=(0.0, top))
         legend_above(ax, 2)
     if limbs is None:

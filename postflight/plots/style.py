@@ -16,7 +16,7 @@ M. Okabe, K. Ito, *Color Universal Design*, 2008.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 import numpy as np
 
 from flightmodel.checks import FloatArray
+from flightmodel.deflection import HOLE_FACTOR
 from flightmodel.telemetry import Telemetry
 
 if TYPE_CHECKING:
@@ -156,6 +157,21 @@ def band(
 def legend_above(ax: Axes, ncols: int, title: str | None = None) -> None:
     """Legend between the axes and what is above them, where no data are."""
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, borderaxespad=0.0, title=title)
+
+
+def with_holes(time_s: FloatArray, columns: Iterable[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
+    """Put a NaN into every hole of a history, so that no line is drawn across; what a hole is: `DeflectionHistory`."""
+    import pandas as pd  # the strokes and colours alone need none
+
+    columns = list(columns)
+    if len(time_s) < 2:
+        return time_s, columns
+    step = np.diff(time_s)
+    # by the steps around: a history may have two rates
+    usual = pd.Series(step).rolling(9, center=True, min_periods=1).median().to_numpy()
+    at = np.flatnonzero(step > HOLE_FACTOR * usual) + 1
+    middle = 0.5 * (time_s[at - 1] + time_s[at])
+    return np.insert(time_s, at, middle), [np.insert(c, at, np.nan) for c in columns]
 
 
 def percentiles(ax: Axes, time_s: FloatArray, low: FloatArray, middle: FloatArray, high: FloatArray) -> None:

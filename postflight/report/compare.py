@@ -18,9 +18,9 @@ from flightmodel.checks import ConfigError, Fault, GateError
 from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
-from postflight.plots.style import LABEL, MANY
+from postflight.plots.style import LABEL, MANY, with_holes
 from postflight.report.compare_other import OTHER_TABLES, charts, compare_with_other, print_other
-from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn, with_holes
+from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
 from postflight.report.write import pulse_window, rendered

@@ -7,7 +7,7 @@ for each time, quantity and label: median, 2.3 and 97.7 percentile, and a nomina
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,9 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.deflection import HOLE_FACTOR
 from flightmodel.statistics import chi_square_quantile
 from postflight.deflections import METHODS
-from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit
+from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
 from postflight.studies.preflight import inside
@@ -148,19 +147,6 @@ def _points(label: str, time_s: FloatArray, values: FloatArray, colour: str, dec
         "colour": colour,
         "of": len(values),
     }
-
-
-def with_holes(time_s: FloatArray, columns: Iterable[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
-    """Put a NaN into every hole of a history, so that no line is drawn across; what a hole is: `DeflectionHistory`."""
-    columns = list(columns)
-    if len(time_s) < 2:
-        return time_s, columns
-    step = np.diff(time_s)
-    # by the steps around: a history may have two rates
-    usual = pd.Series(step).rolling(9, center=True, min_periods=1).median().to_numpy()
-    at = np.flatnonzero(step > HOLE_FACTOR * usual) + 1
-    middle = 0.5 * (time_s[at - 1] + time_s[at])
-    return np.insert(time_s, at, middle), [np.insert(c, at, np.nan) for c in columns]
 
 
 def deflection_panel(run: Run) -> Panel | None:

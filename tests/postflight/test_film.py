@@ -171,3 +171,13 @@ def test_a_benchmark_frame_alone_is_no_answer(flight, command):
     (line,) = [line for line in done.stdout.splitlines() if printed_codes(line) == ["camera-no-frame"]]
     assert {2.0, 424.0, 428.5} <= set(numbers_in(line))
     assert not list(flight.root.rglob("*.webm"))
+
+
+def test_check_does_not_try_a_film_that_is_refused(filmed, command):
+    (filmed.root / "telemetry/camera5.avi").write_text("a line of text\n" * 9)
+    rows = (filmed.root / "telemetry/frames.csv").read_text().splitlines()
+    (filmed.root / "telemetry/frames.csv").write_text("\n".join([rows[0], *(f"{r}.png" for r in rows[1:])]) + "\n")
+    done = command("check", filmed.root)
+    assert done.returncode != 0
+    assert "Traceback" not in done.stderr
+    assert "film-unreadable" in done.stdout + done.stderr

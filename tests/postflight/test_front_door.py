@@ -134,6 +134,14 @@ def test_a_source_to_leave_out_is_one_of_the_flights(flight):
     assert there in refusal.value.faults[1]
 
 
+@pytest.mark.parametrize("wrong", [{"flights": -3}, {"flights": 0}, {"flights": "ten"}, {"workers": 0}])
+def test_a_study_of_no_flights_is_refused_before_its_folder_is_made(tmp_path, wrong):
+    with pytest.raises(pf.GateError) as refusal:
+        pf.monte_carlo("irve2_reference", tmp_path / "study", **wrong)
+    assert refusal.value.codes == ("option-value",)
+    assert not (tmp_path / "study").exists()
+
+
 def test_an_assumption_reaches_every_estimator_that_uses_it(flight, bet, answer):
     """C_N is used by misalignment, trim and fusion, and by no part of the trajectory."""
     other = pf.reconstruct(flight.with_(c_n=1.2))

@@ -139,3 +139,21 @@ def test_radiosondes(name, folder):
     there = 6356766.0 * wet.h_m / (6356766.0 - wet.h_m)
     assert vapour > 5e-4
     assert np.interp(there, s.altitude_m, s.density_kgpm3) / dry == pytest.approx(1.0 - vapour, abs=0.1 * vapour)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("Wind north", "Wind east"), ("wind_n", "wind_e"), ("V wind", "U wind"), ("Northward wind", "Eastward wind")],
+)
+def test_components_of_the_wind_are_not_taken_for_its_speed(folder, tmp_path, names):
+    height = np.arange(0.0, 40e3, 1000.0)
+    columns = {"Height (m)": height, "Density (kg/m3)": 1.2 * np.exp(-height / 7e3)}
+    columns |= {"Temperature (K)": 250.0 + 0.0 * height}
+    columns |= {
+        f"{name} (m/s)": shift + 9.0 * np.sin(height / 9e3) for name, shift in zip(names, (0.0, 5.0), strict=True)
+    }
+    pd.DataFrame(columns).to_csv(tmp_path / "air.csv", index=False)
+    assert CliRunner().invoke(cli, ["import", str(tmp_path / "air.csv"), "--into", str(folder)]).exit_code == 0
+    proposed = tomllib.loads((folder / "flight.toml").read_text())["atmosphere"]["columns"]
+    assert [proposed[q]["column"] for q in ("wind_north", "wind_east")] == [f"{name} (m/s)" for name in names]
+    assert "wind_speed" not in proposed

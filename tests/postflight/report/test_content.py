@@ -15,10 +15,9 @@ import pytest
 
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_clock
-from postflight.plots.style import COLOUR
+from postflight.plots.style import COLOUR, with_holes
 from postflight.report import pictures
 from postflight.report import text as texts
-from postflight.report.panels import with_holes
 from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
 from tests.postflight.report.conftest import HOSTILE
