@@ -4,6 +4,7 @@ import inspect
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -218,6 +219,22 @@ def test_a_reconstruction_gives_the_columns_of_the_product(bet):
     table = bet.to_frame()
     assert {"t_s", "alt_m", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg"} <= set(table.columns)
     assert len(table) == len(bet.trajectory.time_s)
+
+
+def test_rates_and_loads_are_empty_where_the_gyros_are_bridged(flight, bet):
+    rates, gap = flight.telemetry.rates, bet.peak_s + np.array([-1.0, 1.0])
+    there = (rates.time_s < gap[0]) | (rates.time_s > gap[1])
+    cut = replace(rates, time_s=rates.time_s[there], measured_sensor=rates.measured_sensor[there])
+    found = pf.reconstruct(replace(flight, telemetry=replace(flight.telemetry, rates=cut)))
+    table = found.to_frame()
+    inside = ((table.t_s > gap[0] + 0.02) & (table.t_s < gap[1] - 0.02)).to_numpy()
+    for name in ("p_body_degps", "q_body_degps", "q_body_sd_degps"):
+        assert table[name][inside].isna().all()
+        assert table[name][~inside].notna().mean() > 0.98
+    assert table["q_body_degps"][inside].size > 50
+    assert not ((found.loads.time_s > gap[0]) & (found.loads.time_s < gap[1])).any()
+    # position and attitude go on
+    assert table["rotation_x_body_sd_deg"][inside].notna().all()
 
 
 def test_force_coefficients_are_mass_times_acceleration_over_pressure_and_area(flight, bet):
