@@ -183,7 +183,10 @@ def _agreement(run: Run, method: str) -> dict[str, str]:
     failed = mine[~mine["passed"].astype(bool)]
     least = f"smallest probability of a pair {mine['chance'].min():.2g}; limit {1 - CONFIDENCE:.2g}"
     if not len(failed):
+        compared = {o for m in mine["methods"] for o in m.split(" and ")} - {method}
+        silent = all(run.summary["methods"].get(o, {}).get("deflection_deg") is None for o in compared)
         who = "all pairs agree" if method == "fused" else "agrees with the others"
+        who += " where they answer: not here" if silent else ""
         return {"state": "agrees", "mark": "✓", "remark": who, "detail": least}
     if method == "fused":
         return {"state": "differs", "mark": "✕", "remark": "pairs disagree", "detail": "; ".join(failed["methods"])}
