@@ -271,13 +271,15 @@ def _on_grid(path: Path, values: FloatArray) -> AeroTable:
     faults = []
     if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
         wanted = f"{len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
-        faults.append(f"{path}: {len(values)} rows where {wanted}")
+        faults.append(Fault(f"{path}: {len(values)} rows where {wanted}", "aero-grid"))
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
-        faults.append(f"{path}: angles must be evenly spaced from 0, and at least two, as Mach numbers")
+        words = "angles must be evenly spaced from 0, and at least two, as Mach numbers"
+        faults.append(Fault(f"{path}: {words}", "aero-grid"))
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:
-        faults.append(f"{path}: angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met")
+        words = f"angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met"
+        faults.append(Fault(f"{path}: {words}", "aero-grid"))
     if faults:
-        raise GateError(faults, code="aero-grid")
+        raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
     return AeroTable(mach, np.deg2rad(alpha_deg), np.ascontiguousarray(grid))
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
-from flightmodel.files import file_bytes, nothing_at
+from flightmodel.files import file_bytes, leads_outside, nothing_at
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -147,16 +147,16 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_section(model: type[SectionT], path: Path) -> SectionT:
-    """Read a TOML file as ``model``; `ConfigError` with its faults, and the files it names that are not there."""
+    """Read a TOML file as ``model``; `ConfigError` with its faults, and the files below it that it names in vain."""
     tables = read_toml(path)
     try:
         return parse_section(model, tables, str(path))
     except ConfigError as fault:
-        named = [(key, path.parent / name) for key, name in _named_files(tables)]
         absent = [
-            Fault(f"{path}: key '{key}': {file}: {nothing_at(file)}", "file-missing")
-            for key, file in named
-            if not os.path.exists(file)  # False also for a name too long for a file
+            Fault(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
+            for key, name in _named_files(tables)
+            if not any(f"key '{key}'" in words for words in fault.faults) and not leads_outside(path.parent, name)
+            if not os.path.exists(path.parent / name)  # False also for a name too long for a file
         ]
         raise ConfigError([*fault.faults, *absent]) from None
 

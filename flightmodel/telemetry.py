@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from flightmodel.film import Frames
 
 BLOCK_S = 0.5
+LARGEST_GAP_S = 0.1  # of inertial data: beside a longer one a window's mean is not of its middle
 LEAST_REST_S = 2.0  # shorter, and a vehicle that starts at once may pass
 _GRAVITY_MPS2 = 9.8
 _GRAVITY_SHARE = 0.25  # by which an accelerometer may read another size: a weak one is to be found, not to be missed

@@ -36,14 +36,13 @@ from flightmodel.events import find_peak
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.telemetry import LARGEST_GAP_S, Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from postflight.flight import Flight
 from postflight.streams import on_one_thread
 from recon.atmosphere import (
     HALF_WINDOW_S,
-    LARGEST_GAP_S,
     LEAST_AXIAL_MPS2,
     ReconstructedAir,
     as_flown_atmosphere,

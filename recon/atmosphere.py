@@ -47,7 +47,7 @@ from flightmodel.atmosphere import (
 )
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.statistics import correlation
-from flightmodel.telemetry import Telemetry
+from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
@@ -74,7 +74,6 @@ HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
 _EDGE_S = 0.05  # half the windows over which rates are averaged at both ends
 _POINTS = 9  # at which a window's attitude is interpolated
-LARGEST_GAP_S = 0.1  # beside a longer one a window's mean is not of its middle
 
 
 @dataclass(frozen=True)

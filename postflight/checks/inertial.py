@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from flightmodel import earth, rotations, tables
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.flightfolder import Sources
-from flightmodel.telemetry import AttitudePrior, Finding, TriadRecord
+from flightmodel.telemetry import LARGEST_GAP_S, AttitudePrior, Finding, TriadRecord
 from postflight.checks.track_force import Comparison, TrackForce
 from postflight.checks.units_and_axes import (
     AS_DECLARED,
@@ -41,7 +41,6 @@ from postflight.checks.units_and_axes import (
     unit_that_explains,
     window_means,
 )
-from recon.atmosphere import LARGEST_GAP_S
 
 _REST_S = 2.0  # at the record's ends, before release or after landing
 _REST_SPREAD = 0.02  # of the reading's magnitude: at rest it is steadier

@@ -194,8 +194,8 @@ def test_inertial_velocity_errs_with_the_place_by_the_earth_s_turning():
     path = Trajectory(
         "2009-08-17T12:50:00Z", np.zeros(1), "datum", r, 0.0 * r, np.array([[1.0, 0.0, 0.0, 0.0]]), 0.0 * r, covariance
     )  # fmt: skip
-    rates = SimpleNamespace(spec=SimpleNamespace(noise_sd=0.03))
-    bet = SimpleNamespace(smoothed=path, rate_cov=np.tile(0.04**2 * np.eye(3), (1, 1, 1)))
+    rates = SimpleNamespace(spec=SimpleNamespace(noise_sd=0.03, name="rates"))
+    bet = SimpleNamespace(smoothed=path, rate_cov=np.tile(0.04**2 * np.eye(3), (1, 1, 1)), findings=())
     made = reconstruction._inertial(SimpleNamespace(solution=bet))
     assert made["vx_eci_sd_mps"][0] == pytest.approx(1000.0 * earth.OMEGA_RADPS, rel=1e-4)
     assert made["vz_eci_sd_mps"][0] == pytest.approx(1e-4, rel=1e-4)
