@@ -354,7 +354,7 @@ def kept_picture(image: Image | KeptPicture) -> KeptPicture:
 
 
 def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
-    """KeptPicture grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
+    """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
     picture = kept_picture(image)
     h, w = picture.image.shape
     first, last = np.empty(2), np.empty(2)

@@ -183,8 +183,8 @@ def reconstruct(
     known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
     solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
     faults: tuple[SingleFault, ...] = ()
-    told = fault_isolation.ABOUT_DECELERATION
-    if any(not check.passed and check.code not in told for check in solution.consistency_checks):
+    of_readings = fault_isolation.ABOUT_DECELERATION
+    if any(not check.passed and check.code not in of_readings for check in solution.consistency_checks):
         report(0.5, "trying single faults")
         faults = _single_faults(telemetry, settings, solution)
         telemetry, solution = _with_corrected_clock(telemetry, settings, solution, faults)

@@ -123,11 +123,11 @@ def test_control_c_leaves_a_folder_that_goes_on(study_path, tmp_path):
     process = command(study_path, folder, "--flights", str(flights), "--workers", "2")
     wait_for_chunks(process, folder, 3)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to all of them
-    told, printed = (text.decode() for text in process.communicate(timeout=30))
+    output, printed = (text.decode() for text in process.communicate(timeout=30))
     assert process.returncode == 130
     assert "Traceback" not in printed
     assert "interrupted" in printed
-    assert "resumes" in told
+    assert "resumes" in output
     wait_until_alone(process.pid)
     assert not list(folder.rglob(PARTIAL_GLOB))
     found = status(folder)
