@@ -85,6 +85,14 @@ def nearest_name(name: str, known: Iterable[str]) -> str:
     return f" (did you mean '{folded[close[0]]}'?)" if close else ""
 
 
+def check_type(name: str, value: object, kinds: type | tuple[type, ...], made_by: str) -> None:
+    """Raise `GateError` where an argument of the public interface is of another type; say what makes the right one."""
+    if not isinstance(value, kinds):
+        wanted = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
+        given = type(value).__name__
+        raise GateError(f"{name}: {wanted} wanted ({made_by}), {given} given", code="argument-type")
+
+
 def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
     """Return ``array`` as contiguous float64, or raise `GateError` where its shape differs.
 

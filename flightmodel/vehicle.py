@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel.aerodynamics import Aerodynamics, AeroTable, Coefficient, Shape, aerodynamics_from
-from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     ErrorAngle,
@@ -508,6 +508,7 @@ def read_vehicle(name: str | Path) -> Vehicle:
     ConfigError
         With every fault of the file, unknown keys with the nearest known one.
     """
+    check_type("vehicle", name, (str, Path), "a shipped name or the path of a TOML file")
     return vehicle_from_toml(vehicle_path(str(name)))
 
 

@@ -11,11 +11,11 @@ import pandas as pd
 from estimators.camera import sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
-from flightmodel.checks import Fault, FloatArray, GateError, Progress
+from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.filming import CameraAnswer, camera_answer, with_largest
-from postflight.flight import Flight
+from postflight.flight import READ, RECONSTRUCT, Flight
 from postflight.flown_coefficients import AeroIncrements, increments_of
 from postflight.fusing import CameraTimeBias, FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
@@ -187,6 +187,7 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
     GateError
         Where there is no video or it cannot be used.
     """
+    check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ} or {RECONSTRUCT}")
     if isinstance(flown, Flight):
         return camera_answer(flown, None, progress).plain
     return camera_answer(flown.flight, flown, progress).history
@@ -201,6 +202,7 @@ def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
     GateError
         Where there are no inertial sensors or no vehicle.
     """
+    check_type("estimate_misalignment", bet, Reconstruction, RECONSTRUCT)
     return misalignment_history(bet.required_loads())
 
 
@@ -213,6 +215,7 @@ def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
     GateError
         Where there are no inertial sensors or no vehicle.
     """
+    check_type("estimate_trim", bet, Reconstruction, RECONSTRUCT)
     return trim_history(bet.required_loads())
 
 
@@ -230,6 +233,7 @@ def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
     Deflections
         ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
     """
+    check_type("fuse", bet, Reconstruction, RECONSTRUCT)
     wanted = tuple(m for m in METHODS if m != "camera" or bet.telemetry.frames is not None)
     return estimate(bet, wanted, progress)
 
@@ -316,7 +320,9 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     GateError
         Where there is no fused deflection, or the increments do not settle.
     """
+    check_type("aero_increments", bet, Reconstruction, RECONSTRUCT)
     found = fuse(bet) if answers is None else answers
+    check_type("aero_increments: answers", found, Deflections, "pf.fuse(bet)")
     if found.fused is None:
         raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
     return increments_of(found.fused, bet.solution.settings.check_confidence, bet.telemetry.name)

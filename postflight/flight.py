@@ -23,6 +23,8 @@ from flightmodel.telemetry import Finding, Sounding, Telemetry
 from flightmodel.vehicle import MassProperties, Vehicle
 from recon.settings import Settings
 
+READ = "pf.read_flight(folder)"
+RECONSTRUCT = "pf.reconstruct(flight)"
 PULSE_RATE_HZ = 50.0
 SETTINGS = {f.name for f in fields(Settings)}
 
@@ -237,7 +239,7 @@ def _with_setting(settings: Settings, name: str, value: Any) -> Settings:
 
 def _number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low < float(value) < high:
-        raise GateError(f"assumption {name} = {value!r}: a number in {low:g} to {high:g} is wanted", "what-if-value")
+        raise GateError(f"assumption {name} = {value!r}: a number between {low:g} and {high:g} wanted", "what-if-value")
     return float(value)
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import ConfigError, GateError, Progress
+from flightmodel.checks import ConfigError, GateError, Progress, check_type
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.checks.folder_check import Report, check_folder
 from postflight.comparison import sd_bounds
 from postflight.deflections import Deflections
+from postflight.flight import RECONSTRUCT
 from postflight.montecarlo import execution
 from postflight.montecarlo.bands import Merged, merge, write_merged
 from postflight.montecarlo.study import read_study
@@ -68,7 +69,7 @@ def simulate(
     GateError
         The folder exists, or the flight diverged before the telemetry begins.
     """
-    chosen = scenario if isinstance(scenario, Scenario) else read_scenario(str(scenario))
+    chosen = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
     if folder is None:
         return fly_scenario(chosen, seed)
     return simulate_to_folder(chosen, seed, Path(folder), progress, replace)
@@ -176,6 +177,8 @@ def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflec
     GateError
         Where the two flights have no time in common.
     """
+    for look in (first, second):
+        check_type("compare", look, (Reconstruction, Deflections), f"{RECONSTRUCT} or pf.fuse(bet)")
     bets = [x if isinstance(x, Reconstruction) else _bet_of(x) for x in (first, second)]
     rows = _peak_rows(bets[0], bets[1]) + _trajectory_rows(bets[0], bets[1])
     if isinstance(first, Deflections) and isinstance(second, Deflections):

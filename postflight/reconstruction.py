@@ -31,7 +31,7 @@ from estimators.trim import SLOPE_AT_RAD
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
-from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress, check_type
 from flightmodel.events import find_peak
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
@@ -39,7 +39,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.telemetry import LARGEST_GAP_S, Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
-from postflight.flight import Flight
+from postflight.flight import READ, Flight
 from postflight.streams import on_one_thread
 from recon.atmosphere import (
     HALF_WINDOW_S,
@@ -274,8 +274,10 @@ def reconstruct(flight: Flight, settings: Settings | None = None, progress: Prog
     DivergenceError
         Where the trajectory leaves the atmosphere's tables.
     """
+    check_type("reconstruct: flight", flight, Flight, READ)
     report = progress or (lambda _fraction, _what: None)
     if settings is not None:
+        check_type("reconstruct: settings", settings, Settings, "pf.Settings(...)")
         flight = replace(flight, settings=settings)
     report(0.0, "reconstructing")
     solution = solve(flight.telemetry, flight.settings, lambda f, what: report(0.95 * f, what))
@@ -338,6 +340,8 @@ def air_data(trajectory: Trajectory, flight: Flight) -> AirData:
     AirData
         At the trajectory's times, of the vehicle's c.g. (of the followed point without a vehicle).
     """
+    check_type("air_data: trajectory", trajectory, Trajectory, "bet.trajectory")
+    check_type("air_data: flight", flight, Flight, READ)
     return airdata.air_data(trajectory, profile_from_sounding(flight.telemetry.sounding), _arm(flight.vehicle))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     Duration,
@@ -226,9 +226,10 @@ def shipped_scenarios() -> list[str]:
     return sorted(p.stem for p in (DATA / "scenarios").glob("*.toml"))
 
 
-def read_scenario(name: str) -> Scenario:
+def read_scenario(name: str | Path) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
-    shipped = shipped_scenarios()
+    check_type("scenario", name, (str, Path), "a shipped name or the path of a TOML file")
+    name, shipped = str(name), shipped_scenarios()
     if not name.endswith(".toml") and name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
         raise ConfigError(f"no scenario '{name}'{hint}", code="scenario-unknown")

@@ -17,7 +17,7 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import GateError, Progress
+from flightmodel.checks import GateError, Progress, check_type
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
@@ -26,7 +26,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle
 from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
-from postflight.flight import Flight
+from postflight.flight import RECONSTRUCT, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
 from postflight.reconciliation.fit import JointFit, mismatched_spans, require_damping, select_laws
@@ -143,6 +143,7 @@ def reconcile(bet: Reconstruction, progress: Progress | None = None) -> Reconcil
     DivergenceError
         Where the vehicle file's joint diverges.
     """
+    check_type("reconcile", bet, Reconstruction, RECONSTRUCT)
     require_earth(name_of(bet.telemetry.planet), "the reconciliation's simulator")
     return Reconciliation(bet, fit_joint(bet, progress=progress))
 

@@ -71,6 +71,34 @@ def test_public_functions_are_typed(name):
     assert all(p.annotation is not inspect.Parameter.empty for p in signature.parameters.values())
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        pf.reconstruct,
+        lambda wrong: pf.air_data(wrong, wrong),
+        pf.estimate_camera,
+        pf.estimate_misalignment,
+        pf.estimate_trim,
+        pf.fuse,
+        pf.aero_increments,
+        pf.reconcile,
+        lambda wrong: pf.compare(wrong, wrong),
+    ],
+)
+@pytest.mark.parametrize("wrong", ["my-flight", None])
+def test_a_folder_where_a_flight_or_its_trajectory_is_wanted_is_refused(call, wrong):
+    with pytest.raises(pf.GateError) as fault:
+        call(wrong)
+    assert fault.value.codes == ("argument-type",)
+
+
+@pytest.mark.parametrize("call", [pf.read_vehicle, pf.read_scenario, pf.simulate])
+def test_no_file_is_refused_in_words(call):
+    with pytest.raises(pf.GateError) as fault:
+        call(None)
+    assert fault.value.codes == ("argument-type",)
+
+
 def test_unknown_names_are_refused_with_the_known_ones():
     with pytest.raises(AttributeError, match="read_flight"):
         pf.read_fligth  # noqa: B018
@@ -179,6 +207,13 @@ def test_a_command_leaves_out_more_and_writes_at_another_rate_without_a_what_if(
     with pytest.raises(ConfigError) as refusal:
         commands.asked(("c_n", "=1"), (), None)
     assert refusal.value.codes == ("set-form", "set-form")
+
+
+def test_settings_and_answers_are_of_their_types(bet, flight):
+    for call in (lambda: pf.reconstruct(flight, {"fault_tests": False}), lambda: pf.aero_increments(bet, bet)):
+        with pytest.raises(pf.GateError) as fault:
+            call()
+        assert fault.value.codes == ("argument-type",)
 
 
 def test_two_looks_side_by_side(bet, answer, flight):
