@@ -348,18 +348,19 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
     if not flight.peak_is_inside:
-        line("[yellow]found[/]", "the data end before or begin after the peak of dynamic pressure", "peak-outside-data")
+        words = "the data end before or begin after the peak of dynamic pressure"
+        console.coded("[yellow]found[/]", words, "peak-outside-data")
     for words, code in few_of_each((*flight.findings, *run_folder.without_attitude(flight))):
-        line("[yellow]found[/]", words, code)
+        console.coded("[yellow]found[/]", words, code)
     for reason in () if flight.density is not None else flight.missing:  # that is as flown, too
-        line("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
+        console.coded("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
     for rests in flight.rests_on:
         console.print(escape(rests))
     print_checks(flight.consistency_checks, "trajectory")
     for k, suspect in enumerate(flight.suspects):
-        line(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
+        console.coded(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
 
 
 def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
@@ -368,18 +369,13 @@ def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
     console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")
     for check in failed:
         numbers = f"{check.value:.3g} outside {check.low:.3g} to {check.high:.3g}"
-        line("[red]check failed[/]", f"{check.name}: {check.remark} ({numbers})", check.code)
-
-
-def line(mark: str, words: str, code: str = "") -> None:
-    """Print a finding, refusal or failed check with its code in brackets at the end."""
-    console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}")
+        console.coded("[red]check failed[/]", f"{check.name}: {check.remark} ({numbers})", check.code)
 
 
 def print_increments(answers: Deflections) -> None:
     """Aerodynamic increments in one line, and in red those that the preflight table does not allow."""
     if answers.no_increments is not None:
-        line("[yellow]left out[/]", str(answers.no_increments), answers.no_increments.code)
+        console.coded("[yellow]left out[/]", str(answers.no_increments), answers.no_increments.code)
     if answers.increments is None:
         return
     console.print(f"against the preflight table, {escape(answers.increments.about)}")
@@ -436,7 +432,7 @@ def print_answers(answers: Deflections) -> None:
         if check.passed:
             console.print(escape(check.remark))
         else:
-            line("[red]check failed[/]", check.remark, check.code)
+            console.coded("[red]check failed[/]", check.remark, check.code)
     passed = sum(check.passed for check in answers.consistency_checks)
     console.print(f"{passed} of {len(answers.consistency_checks)} consistency checks of the deflection pass")
     bias = None if answers.fused is None else answers.fused.camera_time_bias
@@ -446,7 +442,7 @@ def print_answers(answers: Deflections) -> None:
         console.print(f"shell's shape under load, by video: {escape(answers.camera.shape.verdict)}")
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
-            line("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])
+            console.coded("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])
 
 
 def deflection(
@@ -490,14 +486,16 @@ def deflection(
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
                         write_overlay_film(seen, own, out.path / "figures" / file, progress=report)
     for words, code in few_of_each(telemetry.findings):
-        line("[yellow]found[/]", words, code)
+        console.coded("[yellow]found[/]", words, code)
     if trouble:
-        line("[yellow]no trajectory[/],", f"the camera answers alone: {trouble}", trouble.code)
+        console.coded("[yellow]no trajectory[/],", f"the camera answers alone: {trouble}", trouble.code)
     print_answers(answers)
     if "camera" in answers.histories:
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     elif film:
-        line("[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "film-not-drawn")
+        console.coded(
+            "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "film-not-drawn"
+        )
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
@@ -547,7 +545,7 @@ def print_score(result: Score) -> None:
         f"total angle of attack {bet['alpha_total_rms_deg']:.2f} ({bet['alpha_total_sd_deg']:.2f}) deg"
     )
     for failure in result.failures:
-        line("[red]failed[/]", failure, failure.code)
+        console.coded("[red]failed[/]", failure, failure.code)
     if not result.failures:
         console.print("[green]truth recovered[/] within every limit")
 
@@ -565,7 +563,7 @@ def demo(folder: Path, seed: int) -> None:
     bet, answers, written = run_flight(folder, METHODS, Asked())
     print_flight(bet, run_folder.read_csv(written / "events.csv"))
     for method, reason in answers.refused.items():
-        line("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
+        console.coded("[yellow]no answer[/]", f"from {method}: {reason}", reason.code)
     result = score_run(folder, written)
     picture = folder / "demo.png"
     draw(picture, figure_summary, bet, answers, truth_history(folder))

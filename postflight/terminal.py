@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.markup import escape
 from rich.segment import Segment
 
 from flightmodel.checks import Progress
@@ -29,6 +30,10 @@ class Terminal(Console):
         """Segments of text as rich makes them; its own control sequences are segments apart."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+    def coded(self, mark: str, words: str, code: str = "") -> None:
+        """Print a finding, refusal or failed check behind its mark, with its code in brackets at the end."""
+        self.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
 
     def on_broken_pipe(self) -> None:
         """Go on: results are written to files, whoever reads."""

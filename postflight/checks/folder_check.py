@@ -336,24 +336,20 @@ def print_report(report: Report) -> None:
             table.add_row(escape(f.source), str(f.rows), *span, str(f.missing), escape(f.file))
         console.print(table)
     for words, code in few_of_each(report.findings):
-        _line("[yellow]found[/]", words, code)
+        console.coded("[yellow]found[/]", words, code)
     for remark in report.cross_checks:
-        _line("[red]suspicious[/]", str(remark), remark.code)
+        console.coded("[red]suspicious[/]", str(remark), remark.code)
     for bias in report.time_biases:
         mark = "[yellow]worth a look[/] time bias" if bias.is_worth_a_look else "time bias"
-        _line(mark, f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
+        console.coded(mark, f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
     for section, sizes in report.assumed.items():
         keys = ", ".join(f"{key} = {size:g}" for key, size in sizes.items())
-        _line("[yellow]assumed[/]", f"[{section}] {keys}: not stated in flight.toml", "default-assumed")
+        console.coded("[yellow]assumed[/]", f"[{section}] {keys}: not stated in flight.toml", "default-assumed")
     for open_key in report.fill_in:
-        _line("[cyan]to fill in[/]", open_key, "placeholder")
+        console.coded("[cyan]to fill in[/]", open_key, "placeholder")
     for fault in report.refused:
-        _line("[red]refused[/]", fault, fault.code)
+        console.coded("[red]refused[/]", fault, fault.code)
     console.print(report._about())
-
-
-def _line(mark: str, words: str, code: str = "") -> None:
-    console.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
 
 
 # a camera's benchmark frame, tried as a run would use it: seconds where the lens is not calibrated

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
-from postflight.commands import compile_kernels, console, line
+from postflight.commands import compile_kernels, console
 from postflight.montecarlo import execution
 from postflight.montecarlo.bands import Merged, merge, write_csv, write_merged
 from postflight.montecarlo.execution import Wanted
@@ -57,7 +57,7 @@ def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
     if wanted.scheduler is not None and execution.is_open(wanted.scheduler):
         words = f"--scheduler {wanted.scheduler}: not encrypted, and whoever reaches its port can run code there; use tls://"
-        line("[yellow]found[/]", words, "scheduler-open")
+        console.coded("[yellow]found[/]", words, "scheduler-open")
     try:
         with progress_bar() as report:
             return execution.run(study, folder, wanted, report)
