@@ -181,7 +181,8 @@ def draw_row(picture: Picture, row: int, colour: tuple[int, int, int]) -> None:
 
 def write_lines(picture: Picture, lines: list[str]) -> None:
     """Write lines of text into the upper left corner, black behind white."""
+    around = [(_BLACK, dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]  # OpenCV 5 spaces bold letters further apart
     for k, text in enumerate(lines):
-        at = (10, 22 + 20 * k)
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _BLACK, 3, cv2.LINE_AA)
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
+        for colour, dx, dy in (*around, (_WHITE, 0, 0)):
+            at = (10 + dx, 22 + 20 * k + dy)
+            cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from estimators.overlay import Overlay, centerbody_pixels
+from estimators.overlay import Overlay, centerbody_pixels, write_lines
 from estimators.virtual_camera import VirtualCamera
 from flightmodel.camera import camera_from_mount
 from flightmodel.geometry import BodyMesh, read_mesh
@@ -82,3 +82,12 @@ def test_a_real_capsule_is_drawn(view):
     overlay = Overlay(view, {"aeroshell": BodyMesh(placed, faces, "")})
     _, drawn = overlay.view_of(D(2.0), D(180.0))
     assert drawn.sum() > 1000
+
+
+def test_letters_are_white_with_a_black_rim_of_a_pixel_to_the_end_of_a_line():
+    picture = np.full((40, 600, 3), 128, dtype=np.uint8)
+    write_lines(picture, ["t = 440.624 s, theta 4.87 +/- 0.06 deg, in the plane of 120 deg"])
+    white, black = ((value[..., 0].any(axis=0)).nonzero()[0] for value in (picture > 200, picture < 60))
+    assert white[-1] > 300
+    assert white[0] - 2 <= black[0] <= white[0]
+    assert white[-1] <= black[-1] <= white[-1] + 2
