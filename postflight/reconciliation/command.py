@@ -64,6 +64,7 @@ LAW_NAMES = {
 }
 CONFIDENCE = 0.999  # as the reconstruction's checks
 MOST_OFF_SD = 4.0  # as the camera's time bias
+MOST_BY_STEPS_SD = 0.5  # which widens an interval by an eighth; the fit corrects what is above a tenth
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay) or creep (--creep), than was fitted; mass properties or sensors' places "
@@ -317,7 +318,7 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
 
 def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:
     """Checks of residuals, moves, joins and convergence, and against the stiffness by the joint's frequency."""
-    checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit), *_creep(fit))
+    checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit), *_steps(fit), *_creep(fit))
     # a loose joint oscillates at the frequency of a softer one
     if modal is None or "freeplay" in fit.problem.vehicle_parameters.laws:
         return checks
@@ -367,6 +368,21 @@ def _spans(fit: JointFit) -> ConsistencyCheck:
     return consistency_check(
         "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
         advice="the motion between them is not the fitted joint's",
+    )  # fmt: skip
+
+
+def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded."""
+    if fit.problem.held:
+        return ()
+    moved = np.abs(fit.moves_by_steps_sd)
+    name = fit.problem.vehicle_parameters.names[int(np.argmax(moved))]
+    return (
+        consistency_check(
+            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
+            "finer integration steps move no estimate", f"finer integration steps move {name}", advice=JOINT_WORDS,
+            component=name,
+        ),
     )  # fmt: skip
 
 

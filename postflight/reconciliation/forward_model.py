@@ -57,6 +57,7 @@ TEMPERATURE_KNOT_M = 1e3  # of a correlation length of 5 km; by Mach number it m
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # a priori standard deviations; of factors those of their logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 1.5, 1.0, 0.005
+LOCK_LOG = 30.0  # a spring stiffer by e^30 is a lock: a trial step ends there before numbers overflow
 LEAST_INERTIA = 0.01  # of the stated one: a trial step never makes an inertia negative
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
@@ -124,7 +125,7 @@ class VehicleParameters:
         """Vehicle of parameters (v,), with nominal coefficients (`factors` scales them)."""
         nominal, known, v = self.nominal, self.nominal.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
         joint, shell, body = nominal.joint, nominal.aeroshell, nominal.centerbody
-        stiffer = STIFFNESS_LOG_SD * v["stiffness"]
+        stiffer = min(STIFFNESS_LOG_SD * v["stiffness"], LOCK_LOG)
         stiffness = joint.bending_stiffness_nmprad * np.exp(stiffer)
         # the parameter is the damping ratio: at a given ratio damping grows with the root of the stiffness
         damping = joint.bending_damping_nmsprad * np.exp(DAMPING_LOG_SD * v["damping"] + 0.5 * stiffer)
@@ -382,6 +383,7 @@ class WindowSteps:
 
 
 SLOW_JOINT, FAST_JOINT = WindowSteps(2, 2), WindowSteps(4, 2)
+FINE = WindowSteps(4, 8)  # resolve the joint's twist too: halved once more they move no estimate by 0.1 sd
 FAST_HZ = 6.0  # a window's mean of a faster oscillation is off by more than half a percent with two intervals
 
 

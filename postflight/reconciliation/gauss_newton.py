@@ -19,7 +19,7 @@ minimization", 2012 (geodesic acceleration).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +28,7 @@ from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
     CREEP,
+    FINE,
     MOTION,
     RATE,
     SPAN_S,
@@ -46,6 +47,7 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
 from synthetic_flight import simulate
+from synthetic_flight.dynamics import joint_modes
 
 INSTRUMENTS = 20
 BORDERS = 3  # of the normal equations: of the sounding's errors that are constant in density, north and east wind
@@ -143,6 +145,8 @@ class Problem:
         Factor on all standard deviations, or on each span's.
     creep_per_s : float
         Delayed compliance over the spring's and over the time constant: how fast creep follows a gust.
+    step_error : PredictedSpans, optional
+        What fine integration steps predict, less what the problem's own do: of windows and ends.
     """
 
     measured: Measurements
@@ -151,6 +155,7 @@ class Problem:
     held: tuple[str, ...] = ()
     sd_factor: float | FloatArray = 1.0
     creep_per_s: float = 0.0
+    step_error: PredictedSpans | None = None
 
     @property
     def first_instrument(self) -> int:
@@ -270,8 +275,34 @@ class Problem:
         """Fly every span once; windows without the instruments' errors."""
         return self._predictions([u])[0]
 
+    def with_fine_steps(self, u: Parameters) -> Problem:
+        """Problem that predicts at ``u`` what fine integration steps do, and near it the same changes as before.
+
+        The twist is critically damped there: it follows its load as before, and does not ring from starts that were
+        found with long steps.
+        """
+        nominal = self.vehicle_parameters.nominal
+        inertia, _, stiffness = joint_modes(nominal)["torsion"]
+        damped = nominal.joint.model_copy(update={"torsion_damping_nmsprad": 2.0 * float(np.sqrt(inertia * stiffness))})
+        calm = replace(self.vehicle_parameters, nominal=replace(nominal, joint=damped))
+        fine_steps = replace(self.measured, steps=FINE)
+        (fine,) = replace(self, measured=fine_steps, vehicle_parameters=calm, step_error=None)._flown([u])
+        (own,) = self._flown([u])
+        return replace(self, step_error=replace(fine, windows=fine.windows - own.windows, end=fine.end - own.end))
+
     def _predictions(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
         """`predict` of several parameters, side by side."""
+        return [self._corrected(flown) for flown in self._flown(trials)]
+
+    def _corrected(self, flown: PredictedSpans) -> PredictedSpans:
+        """Predicted spans with the error of the integration steps taken out."""
+        if self.step_error is None:
+            return flown
+        end = flown.end.copy()
+        end[:, : self.step_error.end.shape[1]] += self.step_error.end  # a creep that came later has none
+        return replace(flown, windows=flown.windows + self.step_error.windows, end=end)
+
+    def _flown(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
         spans = self.measured.spans
         number = np.repeat(np.arange(len(trials)), spans)
         air, *others = [self.air.table(u.air, u.warmer_k) for u in trials]
@@ -333,8 +364,9 @@ class Problem:
         With a mask ``wanted`` (count,) by those parameters alone, and by the instruments'.
         """
         flights, columns, steps = self._perturbed(u, np.ones(self.count, dtype=bool) if wanted is None else wanted)
-        moved, base = fly_spans(self.measured, self.vehicle_parameters.nominal, flights), self.predict(u)
-        rows = self.instrument_response(base)
+        moved, base = fly_spans(self.measured, self.vehicle_parameters.nominal, flights), self._flown([u])[0]
+        predicted = self._corrected(base)
+        rows = self.instrument_response(predicted)
         at, sensors, joins = 0, [], []
         for span, (column, step) in enumerate(zip(columns, steps, strict=True)):
             part = slice(at, at := at + len(column))
@@ -351,7 +383,7 @@ class Problem:
                 following = self.first_motion + self.motion * (span + 1) + np.arange(self.motion)
                 response = np.column_stack([-ended.T, np.eye(self.motion)]) * self.join_weight[span][:, None]
                 joins.append((np.concatenate([column, following]), response))
-        return Linearization(self.residuals(u, base), sensors, joins, self.count)
+        return Linearization(self.residuals(u, predicted), sensors, joins, self.count)
 
     def normal_equations(self, u: Parameters, linear: Linearization) -> NormalEquations:
         """Normal equations of a step from ``u``."""

@@ -277,8 +277,10 @@ def test_the_bound_is_continuous_where_the_tail_is_an_exponential():
     assert bounds[0] > 0.0
 
 
-def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
-    """Fit of ten spans: its residuals, the move of one stated number of the vehicle, sd of creep that it lacks."""
+def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0, by_steps=0.1):
+    """Fit of ten spans: residuals, move of one stated number of the vehicle, creep that it lacks and moves by finer
+    steps, sd.
+    """
     parameters = VehicleParameters(VEHICLE)
     values = np.zeros(len(parameters.names))
     values[parameters.names.index("mass of the shell")] = vehicle
@@ -293,6 +295,7 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
     n = len(values) + 20
     normal = NormalEquations(full(2.0 * np.eye(n)), np.zeros(n), np.arange(n))
     found = JointFit(problem, unknown, normal, residuals, 4, converged)
+    found.__dict__["moves_by_steps_sd"] = np.array([0.0, -by_steps, 0.0])
     found.__dict__["creep_scores"] = (CreepScore(2.0, -0.3, 0.05), CreepScore(10.0, 0.02 * creep, 0.02))
     return found
 
@@ -304,6 +307,7 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0):
         ({"vehicle": 1.1 * MOST_MOVED_SD}, "joint-moves"),
         ({"spans": 12.0}, "joint-spans"),
         ({"converged": False}, "joint-converged"),
+        ({"by_steps": 0.6}, "joint-steps"),
         ({"creep": 4.5}, "joint-creep"),
     ],
 )

@@ -107,6 +107,27 @@ def test_spans_flown_from_the_truth_read_and_end_as_the_truth():
     np.testing.assert_allclose(read.end[:-1, VELOCITY], 0.0, atol=5e-4)
 
 
+def test_a_problem_with_fine_steps_predicts_what_they_do_and_changes_as_before():
+    one, u = problem(), true_unknowns()
+    fine = one.with_fine_steps(u)
+    seen, own, corrected = one.measured, one.predict(u), fine.predict(u)
+    truth = np.concatenate([seen.rate_radps, seen.specific_force_mps2], axis=2)
+    across = [1, 2, 4, 5, 7, 8, 10, 11]
+    for names, want in ((("windows", slice(None)), truth), (("end", across), u.motion[1:, across])):
+        off = [np.abs(getattr(each, names[0])[: len(want), ..., names[1]] - want) for each in (own, corrected)]
+        before, after = (each.reshape(-1, want.shape[-1]).max(axis=0) for each in off)
+        assert (after < 0.75 * before + 1e-7).all()
+    moved = u.plus(0.05 * np.random.default_rng(4).standard_normal(one.count))
+    for name in ("windows", "end"):
+        want = getattr(one.predict(moved), name) - getattr(own, name)
+        np.testing.assert_allclose(getattr(fine.predict(moved), name) - getattr(corrected, name), want, atol=1e-12)
+    plain, settled = one.linearize(u), fine.linearize(u)
+    for (_, a), (_, b) in zip(plain.joins, settled.joins, strict=True):
+        np.testing.assert_array_equal(a, b)
+    # once more changes nothing: what is taken out is the error of the steps themselves
+    np.testing.assert_array_equal(fine.with_fine_steps(u).predict(u).end, corrected.end)
+
+
 def test_trials_flown_side_by_side_leave_what_each_leaves_alone():
     one, u = problem(), true_unknowns()
     rng = np.random.default_rng(2)

@@ -40,6 +40,8 @@ from postflight.reconstruction import reconstruct
 from synthetic_flight import simulate
 from synthetic_flight.folder import simulate_to_folder
 from tests.recon import dispersed
+from tests.wide_flights import flown as flown_wide
+from tests.wide_flights import wide_flight
 
 pytestmark = pytest.mark.slow
 SEED = 5
@@ -222,6 +224,20 @@ def test_an_unknown_joint_is_found(flown, monkeypatch):
     true = np.interp(bent.t_s, truth.time_s, np.rad2deg(truth.deflection.theta_rad))
     assert np.sqrt(np.mean((bent.theta_deg - true) ** 2)) < 0.15
     assert {p.name for p in run.iterdir()} >= {"joint.toml", "reconciliation.json", "joint_correlations.csv", "figures"}
+
+
+@pytest.mark.long
+def test_a_joint_bent_by_degrees_on_a_fast_spin_keeps_its_damping(tmp_path):
+    """23 deg at 57 rpm: by the fit's own integration steps the damping comes out 10 % low, 10 sd."""
+    one = wide_flight(61001, bent=True)
+    telemetry, truth = flown_wide(one, tmp_path / "flight")
+    assert np.rad2deg(np.nanmax(truth.deflection.theta_rad)) > 15.0
+    fit = reconcile(reconstruct(Flight(telemetry)))
+    assert fit.problem.step_error is not None
+    assert all(check.passed for check in credibility(fit))
+    row = joint_table(fit).set_index("quantity").loc["damping ratio"]
+    true = one.flown.joint.bending_damping_nmsprad / one.flown.critical_damping_nmsprad()
+    assert abs(np.log(row.found / true)) < 4.0 * row.sd / row.found < 0.06
 
 
 @pytest.mark.long
