@@ -26,7 +26,12 @@ lies aft of the c.g.; elsewhere its sign is open, and a triad turned by half a t
 
 A hypothesis takes over from the data as delivered at a thousand to one. On a vehicle that cones, a lag turns the
 lateral components as a roll does (37 rad/s and 1.4 ms: 3 deg): the angle about roll is known no better than what the
-stated time biases of both clocks make of it.
+stated time biases of both clocks make of it. A mount is the same in all windows; where the angle differs between them
+by more than noise (a joint that gives way by degrees, a cone of 30 deg) it is the relation's own, and adds to the sd.
+
+References
+----------
+R. DerSimonian, N. Laird, "Meta-analysis in clinical trials", 1986 (a mean of values that differ among themselves).
 """
 
 from __future__ import annotations
@@ -190,7 +195,9 @@ def oscillation(
         ROLL: float(roll_log.max() - lag_log[none]),
         MIRRORED: float(mirror_log.max() - lag_log[none]),
     }
-    roll, roll_sd = _refined(roll_log, _ROLL_STEP_RAD)
+    logs = -0.5 * samples * np.log(np.maximum(by_roll[:, use], 1e-9))
+    likeliest = int((logs.sum(axis=1).max(axis=1) - 0.5 * _DAMPING_SD**2).argmax())
+    roll, roll_sd = common_angle(_refined(roll_log, _ROLL_STEP_RAD)[0], logs[likeliest], _ROLL_STEP_RAD)
     beside = (log_likelihood(proper.at(none + k).rests(phases)[:, :, 0]) for k in (-1, 1))
     either_side = [_refined(log, _ROLL_STEP_RAD)[0] for log in beside]
     # a phase and its opposite leave the same rest: half a turn more or less is none
@@ -298,6 +305,29 @@ def _refined(log: FloatArray, step: float) -> tuple[float, float]:
     if curvature <= 0.0:
         return k * step, np.inf
     return float((k + 0.5 * (after - before) / curvature) * step), float(step / np.sqrt(curvature))
+
+
+def common_angle(near: float, logs: FloatArray, step: float) -> tuple[float, float]:
+    """Angle that all windows have, and its sd with what they differ by beyond their noise.
+
+    Parameters
+    ----------
+    near : float
+        The likeliest of all windows together, from the first of the angles, rad.
+    logs : (w, p) float
+        Log likelihood of each window at angles ``step`` apart, of a period of half a turn.
+    step : float
+    """
+    each = np.array([_refined(log, step) for log in logs])
+    off = np.mod(each[:, 0] - near + 0.5 * np.pi, np.pi) - 0.5 * np.pi
+    weight = each[:, 1] ** -2.0
+    if not weight.any():
+        return near, np.inf
+    mean = weight @ off / weight.sum()
+    spread = weight @ (off - mean) ** 2 - (len(off) - 1)
+    between = max(spread / (weight.sum() - weight @ weight / weight.sum()), 0.0)
+    weight = 1.0 / (each[:, 1] ** 2 + between)
+    return float(near + weight @ off / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) -> ConsistencyCheck:

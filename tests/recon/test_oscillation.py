@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from recon.fault_isolation import isolate_faults
 from recon.imu_screening import bridge
-from recon.oscillation import DELIVERED, LAG, MIRRORED, ROLL, axes_check, oscillation
+from recon.oscillation import DELIVERED, LAG, MIRRORED, ROLL, axes_check, common_angle, oscillation
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.single_faults import SingleFault, corrections, likeliest, ranked
@@ -187,3 +187,23 @@ def test_a_tracker_whose_points_are_all_rejected_is_red_and_named(mini_sense):
 def test_a_sound_flight_tries_nothing(mini_sense):
     telemetry, _ = mini_sense(47)
     assert reconstruct(telemetry, FAST).single_faults == ()
+
+
+def test_an_angle_that_differs_between_windows_is_known_no_better_than_they_agree():
+    step, sd = np.deg2rad(1.0), np.deg2rad(0.5)
+    grid = np.linspace(-np.pi, np.pi, 360, endpoint=False)
+
+    def logs(angles_deg):
+        off = np.mod(grid - np.deg2rad(angles_deg)[:, None] + 0.5 * np.pi, np.pi) - 0.5 * np.pi
+        return -0.5 * (off / sd) ** 2
+
+    alike = np.array([-3.2, -2.8, -3.0, -3.0])
+    angle, known = common_angle(-3.0 * step, logs(alike), step)
+    assert np.mod(angle + np.pi, np.pi) == pytest.approx(np.pi - 3.0 * step, abs=1e-3)
+    assert known == pytest.approx(sd / 2.0, rel=0.01)
+    # of four windows that differ by 2 deg each: as of four draws of that scatter
+    apart = np.array([-5.0, -3.0, -1.0, 1.0])
+    angle, known = common_angle(-2.0 * step, logs(apart), step)
+    assert np.mod(angle + np.pi, np.pi) == pytest.approx(np.pi - 2.0 * step, abs=1e-3)
+    assert known == pytest.approx(np.deg2rad(apart).std(ddof=1) / 2.0, rel=0.01)
+    assert common_angle(0.3, np.zeros((4, 360)), step) == (0.3, np.inf)
