@@ -136,6 +136,9 @@ def print_coverage(rows):
     names = "log stiffness", "log damping ratio", "offset y cm", "offset z cm", "static stability", "by the frequency"
     for k, name in enumerate(names):
         known = np.isfinite(a[:, 2 * k])
+        if not known.any():
+            print(f"{name:18} no flight")
+            continue
         e, z = a[known, 2 * k], a[known, 2 * k] / a[known, 2 * k + 1]
         inside = ", ".join(f"{100 * np.mean(np.abs(z) < s):.0f} % inside {s} sd" for s in (1, 2))
         rms = f"rms {np.sqrt(np.mean(e**2)):.4f} bias {e.mean():+.4f}, rms of z {np.sqrt(np.mean(z**2)):.2f}"
