@@ -10,7 +10,7 @@ alone, with or without the Earth, clean or degraded. ``--footage``: folders of a
 vehicle's camera 5, whose paint is not what the vehicle file states.
 
 Counted is a film as **confidently wrong** when more than a twentieth of its answered frames err by more than 4 stated
-sd (two components, of the probability of 4 sd of one).
+sd (two components, of the probability of 4 sd of one), and no check of the deflection is red.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from flightmodel.checks import GateError
 from flightmodel.deflection import lv_direction
 from flightmodel.film import film_frames
 from flightmodel.vehicle import vehicle_path
-from postflight.filming import camera_film
+from postflight.filming import camera_answer, camera_film
 from postflight.flight import read_flight
 from synthetic_flight.film import Imaging, Scene, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, sun
@@ -110,7 +110,7 @@ def stock(path: Path) -> list[Footage]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a spoilt film: code of its refusal, frames answered, beyond 4 sd, largest error and its sd."""
+    """What became of a spoilt film: code of its refusal, frames answered, beyond 4 sd, largest error, its sd, red."""
 
     number: int
     kinds: tuple[str, ...]
@@ -120,11 +120,12 @@ class Outcome:
     beyond: int = 0
     error_deg: float = 0.0
     sd_deg: float = 0.0
+    is_red: bool = False
 
     @property
     def is_confidently_wrong(self) -> bool:
         """Whether more answers are wrong than may be, and nothing says so."""
-        return self.beyond > FEW * self.answered
+        return not self.is_red and self.beyond > FEW * self.answered
 
 
 def laid_out(footage: Footage, folder: Path) -> None:
@@ -154,17 +155,19 @@ def _changed(toml: str, section: str, values: Mapping[str, Any]) -> str:
     return head + body + rest
 
 
-def read_as_a_user(footage: Footage) -> tuple[int, int, float, float]:
-    """Frames answered, of them beyond 4 sd, the largest error, deg, and the sd there, deg.
+def read_as_a_user(footage: Footage) -> tuple[int, int, float, float, bool]:
+    """Frames answered, of them beyond 4 sd, the largest error, deg, the sd there, deg, and whether a check is red.
 
     `GateError` where the film is refused.
     """
     with tempfile.TemporaryDirectory() as root:
         laid_out(footage, Path(root))
-        fits = camera_film(read_flight(root, needs_path=False)).fits
+        flight = read_flight(root, needs_path=False)
+        film = camera_film(flight)
+        is_red = not all(check.passed for check in camera_answer(flight, None, film=film).consistency_checks)
     off_benchmark = np.abs(footage.time_s - footage.benchmark_s) > 1e-3
     answered, beyond, worst = 0, 0, (0.0, 0.0)
-    for fit, yz, other in zip(fits, footage.theta_yz_rad, off_benchmark, strict=True):
+    for fit, yz, other in zip(film.fits, footage.theta_yz_rad, off_benchmark, strict=True):
         if fit.refused or not other:
             continue
         # the lateral vector of a rotation about body y and z
@@ -174,7 +177,7 @@ def read_as_a_user(footage: Footage) -> tuple[int, int, float, float]:
         size = float(np.rad2deg(np.linalg.norm(error)))
         if size > worst[0]:
             worst = (size, float(np.rad2deg(np.sqrt(0.5 * np.trace(fit.covariance)))))
-    return answered, beyond, *worst
+    return answered, beyond, *worst, is_red
 
 
 def trial(job: tuple[Path, int, int, str, tuple[str, ...]]) -> Outcome:
@@ -206,12 +209,12 @@ def report(outcomes: list[Outcome]) -> int:
     by_kind = defaultdict(list)
     for one in outcomes:
         by_kind[" + ".join(one.kinds) if len(one.kinds) == 1 else "several"].append(one)
-    print(f"{'spoiling':16s} films refused  no answer  answered frames  beyond 4 sd  confidently wrong")
+    print(f"{'spoiling':16s} films refused  no answer  red  answered frames  beyond 4 sd  confidently wrong")
     for kind, some in by_kind.items():
         answered, beyond = sum(o.answered for o in some), sum(o.beyond for o in some)
         refused, empty = sum(bool(o.code) for o in some), sum(not o.code and not o.answered for o in some)
-        wrong = sum(o.is_confidently_wrong for o in some)
-        print(f"{kind:16s} {len(some):5d} {refused:7d} {empty:10d} {answered:16d} {beyond:12d} {wrong:18d}")
+        wrong, red = sum(o.is_confidently_wrong for o in some), sum(o.is_red for o in some)
+        print(f"{kind:16s} {len(some):5d} {refused:7d} {empty:10d} {red:4d} {answered:16d} {beyond:12d} {wrong:18d}")
     codes = Counter(o.code for o in outcomes if o.code)
     print(f"refused with: {dict(codes.most_common())}")
     wrong = [o for o in outcomes if o.is_confidently_wrong]

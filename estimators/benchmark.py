@@ -50,6 +50,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import softmax
 
+from estimators.body_edge import body_edge
 from estimators.camera_fit import USUAL_SHARE, Image, OrientedCamera
 from estimators.edge import (
     NO_FAULT,
@@ -327,6 +328,7 @@ def _fitted(
         look.view, look.clocks_rad, look.lines, features, apriori, look.horizon, look.residuals, pose[:8],
         formal[:_POSES, :_POSES], per_deflection, rms, support=_share_found(look, features),
         breaks=breaks_across(benchmark.image), steepness=steepness_of(benchmark.image, look.horizon),
+        body=body_edge(look.view, benchmark.kept),
     )  # fmt: skip
 
 

@@ -346,7 +346,7 @@ def judged(
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
     found = without_lost_features(kept) if textured_s is None else without_stray_texture(time_s, kept, textured_s)
-    found = without_remnants(without_doubtful(without_mixed(found)))
+    found = without_remnants(without_doubtful(without_moved(without_mixed(found))))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -405,6 +405,22 @@ def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
         return fits
     words = f"{doubled} frames show, or may show, the edge twice: the film mixes pictures; an edge may lie between two"
     return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
+
+
+def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
+    """Refuse answers of frames that do not show the centerbody's edge, next to one in which it has moved.
+
+    A camera that moved in its mount stays where it is. Next are the nearest frames on both sides that show that edge.
+    """
+    telling = np.flatnonzero(np.isfinite([fit.mount_px for fit in fits]))
+    moved = np.array([fits[k].mount_px > 0.0 for k in telling], dtype=bool)
+    words = "the camera moved in its mount before or after this frame, which does not show the centerbody's own edge"
+    out = []
+    for k, fit in enumerate(fits):
+        at = int(np.searchsorted(telling, k))
+        unsure = not fit.refused and np.isnan(fit.mount_px) and bool(moved[max(at - 1, 0) : at + 1].any())
+        out.append(refused_fit(fit.horizon, Fault(words, "camera-turned")) if unsure else fit)
+    return out
 
 
 def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:

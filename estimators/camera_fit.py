@@ -4,7 +4,8 @@ Where the shell is may be known from the frame before; else it is sought: where 
 is from far, where the map of features or of the valleys between tori fits (behind the rim may be the Earth, whose limb
 is an edge too). Edge and features near there are fitted (`estimators.frame_solution`), each also by itself: where they
 contradict each other a whole edge counts, and a frame whose edge is not whole is refused. So is a frame that a
-deflection does not explain (`estimators.frame_checks`), or that shows the edge twice (`estimators.edge`).
+deflection does not explain (`estimators.frame_checks`), that shows the edge twice (`estimators.edge`), or the
+centerbody elsewhere (`estimators.body_edge`).
 
 Assumed: as in `estimators.frame_solution`.
 
@@ -136,6 +137,7 @@ class OrientedCamera(FrameModel):
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
         deformation[:2] = 0.0 if start is None else start
+        mount_px = self._mount_px(frame)
         try:
             painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
             if isinstance(painted, ImageFeatures) and len(painted.points_shell_m):
@@ -153,6 +155,12 @@ class OrientedCamera(FrameModel):
                     self._check_seen(horizon, last)
                 doubled = self._doubled(frame, horizon, deformation)
                 self._check_sharp(frame, horizon)
+                if mount_px > 0.0:
+                    raise NoFitError(
+                        f"the centerbody's own edge has moved by {mount_px:.1f} px since the benchmark frame: the "
+                        "camera moved in its mount, or the picture was moved",
+                        "camera-turned",
+                    )
                 last = self._explained(place, deformation, last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
@@ -164,8 +172,9 @@ class OrientedCamera(FrameModel):
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except NoFitError as refusal:
-            return refused_fit(horizon, refusal.faults[0])
-        return replace(self._answer(horizon, deformation, last, basis), contradicted=contradicted, doubled=doubled)
+            return refused_fit(horizon, refusal.faults[0], mount_px)
+        answer = self._answer(horizon, deformation, last, basis)
+        return replace(answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px)
 
     def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
         """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.
@@ -235,6 +244,12 @@ class OrientedCamera(FrameModel):
                 f"by {100.0 * self.steepness:.0f} %: one of the two is out of focus",
                 "edge-blurred",
             )
+
+    def _mount_px(self, frame: EditedFrame) -> float:
+        """How far the camera has moved in its mount, by `estimators.body_edge`; NaN where nothing tells."""
+        if self.body is None:
+            return float("nan")
+        return self.body.moved_px(frame.kept, frame.is_clear(self.body.lines.origin_px))
 
     def points_at(
         self, picture: Image | EditedFrame, own: FloatArray, tried: FloatArray

@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _fit_kernels
+from estimators.body_edge import BodyEdge
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines
 from estimators.features import Features, light_shift
 from estimators.frame_checks import WORST_SHAPE
@@ -129,6 +130,8 @@ class FrameFit:
         Whether a whole edge alone gave the answer, against the features.
     doubled : float
         Share of edge points that agree on a second edge; zero if usual.
+    mount_px : float
+        How far the centerbody's own edge has moved in the picture; NaN where nothing tells.
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None
@@ -146,6 +149,7 @@ class FrameFit:
     refused: Fault = NO_FAULT
     contradicted: bool = False
     doubled: float = 0.0
+    mount_px: float = float("nan")
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
 
@@ -202,10 +206,10 @@ def least_points(horizon: HorizonLine) -> int:
     return LEAST_MARKS if horizon.is_by_hand else LEAST_POINTS
 
 
-def refused_fit(horizon: HorizonLine, reason: Fault) -> FrameFit:
+def refused_fit(horizon: HorizonLine, reason: Fault, mount_px: float = float("nan")) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
-    return FrameFit(nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason)
+    return FrameFit(nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason, mount_px=mount_px)
 
 
 @dataclass(frozen=True)
@@ -242,6 +246,8 @@ class FrameModel:
         Rows after which the benchmark frame breaks across its width.
     steepness : float
         Of the benchmark frame's edge; see `estimators.edge.steepness_of`.
+    body : BodyEdge or None
+        The centerbody's silhouette in the benchmark frame.
     """
 
     view: VirtualCamera
@@ -259,6 +265,7 @@ class FrameModel:
     support: float = 1.0
     breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
     steepness: float = float("nan")
+    body: BodyEdge | None = field(default=None, repr=False)
 
     @cached_property
     def _benchmark_edge(self) -> BoolArray:

@@ -8,11 +8,13 @@ before it and those after it apart, the readings ``r_k`` and their covariances `
 
 where ``u = max |r| / max |l - l_benchmark|`` is deflection per load, and ``m' C^-1 m`` is a chi-square of two. A film
 without such frames can only be asked what its benchmark's own load amounts to, ``u l_benchmark``, against the sd ``p``
-with which it is taken as undeflected.
+with which it is taken as undeflected. Where no load is known, the film itself speaks: before the load, and after it,
+nothing deflects the shell, so that of a benchmark frame at rest all frames before it are at rest, or all after it.
 
-Assumed: deflection follows the load, within a factor of two (dynamic pressure stands for the moment in the joint where
-no inertial sensors measured it, whatever the angle of attack was); a joint without load rests within ``p`` of where it
-rested in the benchmark frame (friction); the frames' errors are in common: the mean's sd is that of one frame.
+Assumed: one pulse of load; deflection follows the load, within a factor of two (dynamic pressure stands for the moment
+in the joint where no inertial sensors measured it, whatever the angle of attack was); a joint without load rests within
+``p`` of where it rested in the benchmark frame (friction); the frames' errors are in common: the mean's sd is that of
+one frame.
 """
 
 from __future__ import annotations
@@ -22,13 +24,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimators.agreement import CONFIDENCE
-from flightmodel.checks import FloatArray
+from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import chi_square_quantile
 
 _LITTLE = 0.1  # of the largest load: the frames' own deflection is then small beside what is looked for
 _LOAD_FACTOR = 2.0  # of what the load explains: the angle of attack off the peak may be twice that at it
 _WORST_BY_LOAD = 2.0  # sd of the benchmark's prior, beyond which the readings' error bars do not hold
+_MISREAD = 10  # one frame of so many may be
 
 
 @dataclass(frozen=True)
@@ -39,15 +42,17 @@ class Rest:
     ----------
     theta_rad : float
         Mean deflection of the frames with little load, of those before and those after the largest load the worse; or
-        without them that of the benchmark frame by its load.
+        without them that of the benchmark frame by its load; or without any load largest deflection of the frames on
+        the benchmark's quieter side (one of ten left out).
     over_sd : float
         The same over its sd.
     limit : float
         Largest ``over_sd`` that passes.
     frames : int
-        Frames with little load; 0: none.
+        Frames with little load, or on the quieter side; 0: none.
     span_s : tuple of float
         First and last of them, or the benchmark frame's time twice.
+    knows_load : bool
     """
 
     theta_rad: float
@@ -55,6 +60,7 @@ class Rest:
     limit: float
     frames: int
     span_s: tuple[float, float]
+    knows_load: bool = True
 
     @property
     def passed(self) -> bool:
@@ -69,6 +75,14 @@ class Rest:
             found = f"the benchmark frame's load deflects the shell by about {size:.2f} deg, and no frame has less"
             return found if self.passed else f"{found}: state another benchmark_s, of a frame with little load"
         first, last = self.span_s
+        if not self.knows_load:
+            found = f"{self.frames} frames on one side of the benchmark frame ({first:.2f} to {last:.2f} s) show "
+            if self.passed:
+                return f"{found}the shell at rest"
+            return (
+                f"{found}up to {size:.2f} deg, {self.over_sd:.1f} sd from rest, those on its other side more: the "
+                "benchmark frame is under load: state another benchmark_s, of a frame before or after the load"
+            )
         found = f"{self.frames} frames with little load ({first:.2f} to {last:.2f} s) show {size:.2f} deg on average"
         if self.passed:
             return found
@@ -101,9 +115,10 @@ def rest_of(
     at = int(np.argmin(np.abs(history.time_s - benchmark_s)))
     other = np.arange(len(load)) != at
     theta, covariance = history.theta_yz_rad, history.lateral_cov_without_plane
-    known = other & np.isfinite(load) & np.isfinite(theta).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    answered = other & np.isfinite(theta).all(axis=1) & np.isfinite(covariance).all(axis=(1, 2))
+    known = answered & np.isfinite(load)
     if not np.any(load[known] != load[at]) or not np.isfinite(load[at]):
-        return None
+        return None if corrected else _by_sides(history.time_s, theta, covariance, answered, at, prior_sd_rad)
     per_load = np.linalg.norm(theta[known], axis=1).max() / np.abs(load[known] - load[at]).max()
     largest = max(load[known].max(), load[at])
     little = known & (load <= _LITTLE * largest)
@@ -124,6 +139,25 @@ def rest_of(
         return None
     by_load = float(per_load * load[at])
     return Rest(by_load, by_load / prior_sd_rad, _WORST_BY_LOAD, 0, (benchmark_s, benchmark_s))
+
+
+def _by_sides(
+    time_s: FloatArray, theta: FloatArray, covariance: FloatArray, answered: BoolArray, at: int, prior_sd_rad: float
+) -> Rest | None:
+    """Whether all frames on one side of the benchmark frame show rest; None where a side has no answer."""
+    number, found = np.arange(len(theta)), []
+    for side in (number < at, number > at):
+        rows = np.flatnonzero(answered & side)
+        if not len(rows):
+            return None
+        spread = covariance[rows] + prior_sd_rad**2 * np.eye(2)
+        square = np.einsum("ni,ni->n", theta[rows], np.linalg.solve(spread, theta[rows][:, :, None])[:, :, 0])
+        worst = int(np.argsort(-square)[len(rows) // _MISREAD])
+        limit = float(np.sqrt(chi_square_quantile(1.0 - (1.0 - CONFIDENCE) / len(rows), 2)))
+        size, over_sd = float(np.linalg.norm(theta[rows[worst]])), float(np.sqrt(square[worst]))
+        span = float(time_s[rows[0]]), float(time_s[rows[-1]])
+        found.append(Rest(size, over_sd, limit, len(rows), span, knows_load=False))
+    return min(found, key=lambda one: one.over_sd / one.limit)
 
 
 def _mean(readings: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -274,13 +274,13 @@ def _benchmark(
 def _rests(
     name: str, film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool
 ) -> dict[str, Rest]:
-    """Whether a camera's shell rests in frames without load, by name; nothing where no load or no frame can say.
+    """Whether a camera's shell rests in frames without load, by name; nothing where no frame can say.
 
-    The load is the moment in the joint, or without inertial sensors the dynamic pressure.
+    The load is the moment in the joint, or without inertial sensors the dynamic pressure; unknown without a trajectory.
     """
     if bet is None:
-        return {}
-    if bet.loads is None:
+        load = np.full(len(film.time_s), np.nan)
+    elif bet.loads is None:
         load = _with_pressure(film, bet).pressure_pa
     else:
         moment_nm = np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)

@@ -79,8 +79,21 @@ def test_without_frames_of_little_load_the_benchmark_s_own_load_counts():
     assert soft.over_sd == pytest.approx(0.1 * found.over_sd, rel=1e-9)
 
 
-def test_nothing_tells_without_a_load_at_the_frames():
+def test_without_a_load_the_frames_on_both_sides_tell():
+    """A benchmark at rest has frames at rest on one side, before the pulse or after it; one under load on none."""
+    unknown = np.full_like(LOAD, np.nan)
+    for at in (8, 38):
+        assert read(at=at, load=unknown).passed
+    for at in (14, 20, 26):
+        found = read(at=at, load=unknown)
+        assert not found.passed
+        assert "benchmark_s" in found.remark
+    misread = DEFLECTION.copy()
+    misread[3] += D(3.0)
+    assert read(misread, at=10, load=unknown).passed
+    assert read(at=20, load=unknown, corrected=True) is None
+
+
+def test_nothing_tells_without_a_load_on_one_side_alone():
     assert read(load=np.full_like(LOAD, np.nan)) is None
-    only = np.where(np.arange(len(LOAD)) == 20, np.nan, LOAD)
-    assert read(at=20, load=only) is None
     assert read(load=np.zeros_like(LOAD)) is None
