@@ -401,10 +401,16 @@ def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:
 
 
 def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
-    """Estimate of a camera time bias stated as zero; None where there is no common answer with it free."""
-    for sd_s in _WIDE_BIAS_SD_S:
+    """Estimate of a camera time bias stated as zero; None where there is no common answer with it free.
+
+    Where there is none by all methods, without the trim, the least exact: a vehicle that spins fast looks alike a
+    period later, and the search for the bias, before it knows any other input, may begin at the wrong one.
+    """
+    wide_s, names = _WIDE_BIAS_SD_S[-1], sources.names
+    without_trim = tuple(n for n in names if n != "trim")
+    for sd_s, of in (*((sd_s, names) for sd_s in _WIDE_BIAS_SD_S), (wide_s, without_trim)):
         with contextlib.suppress(DivergenceError):
-            return _time_bias(sources.fused(sources.reader(sources.names, sd_s)), sd_s, False)
+            return _time_bias(sources.fused(sources.reader(of, sd_s)), sd_s, False)
     return None
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
-from flightmodel.checks import Fault
+from estimators.fusion import fuse
+from flightmodel.checks import DivergenceError, Fault
 from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
+from postflight import fusing
 from postflight.deflections import Deflections, quantiles_at
 from postflight.fusing import _mixed, fuse_flight
 from tests.estimators.conftest import VEHICLE, pulse_of
@@ -74,6 +76,17 @@ def test_a_bad_film_is_left_out_and_named(name):
 def test_a_film_that_is_early_by_most_of_a_period_has_its_time_bias():
     bias = fuse_flight(sound(), film(motion(TIME_S + 1.5))).camera_time_bias
     assert bias.is_off
+    assert bias.offset_s == pytest.approx(-1.5, abs=4.0 * bias.sd_s)
+
+
+def test_a_time_bias_is_found_without_the_trim_where_all_methods_have_no_answer(monkeypatch):
+    def diverging(read, **kwargs):
+        if any(e.method == "trim" for e in read({}, None)):
+            raise DivergenceError("it still moves", code="fusion-not-converged")
+        return fuse(read, **kwargs)
+
+    monkeypatch.setattr(fusing, "fuse", diverging)
+    bias = fusing.time_bias_if_free(sound(), film(motion(TIME_S + 1.5)))
     assert bias.offset_s == pytest.approx(-1.5, abs=4.0 * bias.sd_s)
 
 
