@@ -1,7 +1,7 @@
 """Spoilt films: is a film that cannot be read refused, or answered wrongly with a small standard deviation?
 
     python benchmarks/video_spoiling.py [films] [--seed S] [--only KIND ...] [--kinds shaped|held-back|all|none|two]
-                                        [--footage FOLDER ...] [--listed]
+                                        [--footage FOLDER ...] [--first NUMBER] [--listed]
 
 Every film is spoilt at random (`spoilings.py`), laid into a flight folder and read as ``postflight deflection FLIGHT
 --method camera`` reads it. Its own footage is the synthetic film's: 12 frames, one a second, drawn features or the edge
@@ -231,6 +231,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--kinds", default="all", choices=["shaped", "held-back", "all", "none", "two"])
     parser.add_argument("--footage", nargs="*", type=Path, default=[])
+    parser.add_argument("--first", type=int, default=0, help="number of the first own film")
     parser.add_argument("--stock", type=Path, default=None, help="where the films to spoil are kept between calls")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--listed", action="store_true", help="a line for every film confidently wrong or crashed")
@@ -239,7 +240,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as root, ProcessPoolExecutor(chosen.processes) as pool:
         path = chosen.stock or Path(root) / "stock"
         if not path.exists():
-            films = [*pool.map(own_film, range(STOCK)), *map(others_film, chosen.footage)]
+            films = [*pool.map(own_film, range(chosen.first, chosen.first + STOCK)), *map(others_film, chosen.footage)]
             path.write_bytes(pickle.dumps(films))
             print(f"{len(films)} films in {time.perf_counter() - begun:.0f} s", flush=True)
         jobs = [(path, chosen.seed, k, chosen.kinds, tuple(chosen.only)) for k in range(chosen.films)]
