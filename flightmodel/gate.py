@@ -241,12 +241,12 @@ class Gate:
         held = {short: column[rows] for short, column in table.columns.items()}
         return Table(table.path, table.label, table.time_s[rows], held, table.lines[rows])
 
-    def refuse_rows(self, table: Table, short: str, low: float, high: float, words: str) -> None:
+    def refuse_rows(self, table: Table, short: str, low: float, high: float | FloatArray, words: str) -> None:
         """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""
         values = table.columns.get(short)
         if values is None:
             return
-        if np.fmin.reduce(values) >= low and np.fmax.reduce(values) <= high:
+        if np.fmin.reduce(values) >= low and np.fmax.reduce(values) <= np.min(high):
             return
         with np.errstate(invalid="ignore"):
             wild = (values < low) | (values > high)

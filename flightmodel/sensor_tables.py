@@ -689,6 +689,7 @@ SMALLEST_SD = 1e-6  # a fraction, and m/s
 # pressure may depart from the gas law by this much before it is worth a word (separate instruments, humidity)
 GAS_LAW_TOLERANCE = 0.05
 LOWEST_TOP_M = 60e3
+HEATED_M = 100e3  # the thermosphere begins below, and has 400 K of the standard's at 124 km
 BALLOON_TOP_M = 32e3  # above it the densities' own errors grow
 HYDROSTATIC_TOLERANCE = 0.15  # over a scale height, from two densities with errors of 2 %: 5 sd
 
@@ -702,7 +703,8 @@ def read_sounding(gate: Gate, source: AtmosphereEntry, planet: earth.Planet = ea
     lowest = -1000.0 if planet == earth.WGS84 else bottom_m(planet)
     gate.refuse_rows(table, "alt", lowest, 2.0e5, f"outside {lowest / 1000:.0f} to 200 km")
     gate.refuse_rows(table, "rho", TINY, 2.0, "no density of the Earth's air")
-    gate.refuse_rows(table, "temperature", 80.0, 400.0, "outside 80 to 400 K")
+    hottest = np.where(table.columns["alt"] > HEATED_M, 2000.0, 400.0)
+    gate.refuse_rows(table, "temperature", 80.0, hottest, "outside 80 to 400 K, above 100 km to 2000 K")
     for short in ("wind_north", "wind_east", "wind_speed"):
         gate.refuse_rows(table, short, -300.0, 300.0, "above 300 m/s")
     gate.refuse_rows(table, "rho_sd", SMALLEST_SD, 10.0, "no standard deviation of a density, as a fraction")

@@ -347,8 +347,8 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
-    if not flight.peak_is_inside:
-        words = "the data end before or begin after the peak of dynamic pressure"
+    if flight.peak_lies:
+        words = f"the largest dynamic pressure is no peak: {flight.peak_lies}"
         console.coded("[yellow]found[/]", words, "peak-outside-data")
     for words, code in few_of_each((*flight.findings, *run_folder.without_attitude(flight))):
         console.coded("[yellow]found[/]", words, code)

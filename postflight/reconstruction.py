@@ -31,7 +31,7 @@ from estimators.trim import SLOPE_AT_RAD
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
-from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError, Progress, check_type
+from flightmodel.checks import BoolArray, DivergenceError, Fault, FloatArray, GateError, Progress, check_type
 from flightmodel.events import find_peak
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
@@ -116,6 +116,8 @@ _FORCE_NAMES = (
 # vehicle that pitches and spins faster. At least some samples must lie in it
 _HALF_WINDOW_S, _MOST_TURN_RAD, _LEAST_SAMPLES = 0.02, 0.31, 2.5
 _RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+_EDGE_S = 1.0  # from data's end, or a gap's, within which a largest value is not taken for a peak
+_NO_READINGS = ("data-gap", "samples-missing", "frozen-data")
 # why the check is not independent, by code
 DEPENDENCE = {
     "": "",
@@ -215,6 +217,7 @@ class Reconstruction(Tabular):
         if self.has_attitude or drag is None:
             return None
         value = 0.5 * np.exp(drag.log_drag) * self.air.airspeed_mps**2
+        value[self._unread(self.air.time_s)] = np.nan
         return value, value * drag.pressure_sd
 
     def required_loads(self) -> FlightLoads:
@@ -235,9 +238,20 @@ class Reconstruction(Tabular):
         return float(inside[0]), float(inside[-1])
 
     @property
-    def peak_is_inside(self) -> bool:
-        """Whether the largest dynamic pressure is a peak, not the first or last second of the data."""
-        return self.air.time_s[0] + 1.0 < self.peak_s < self.air.time_s[-1] - 1.0
+    def peak_lies(self) -> str:
+        """Where the largest dynamic pressure lies that is no peak, in words; empty of a peak."""
+        if self._unread(np.array([self.peak_s]), _EDGE_S)[0]:
+            return "gap in the data"
+        return "" if self.air.time_s[0] + _EDGE_S < self.peak_s < self.air.time_s[-1] - _EDGE_S else "edge of data"
+
+    def _unread(self, time_s: FloatArray, about_s: float = 0.0) -> BoolArray:
+        """Whether an accelerometer that the drag follows has no readings for long at, or about, times (n,)."""
+        record, out = self.telemetry.drag_accelerometer, np.zeros(len(time_s), dtype=bool)
+        for gap in self.findings:
+            long = gap.end_s - gap.start_s > _EDGE_S
+            if record is not None and gap.source == record.spec.name and gap.code in _NO_READINGS and long:
+                out |= (gap.start_s - about_s < time_s) & (time_s < gap.end_s + about_s)
+        return out
 
     def to_frame(self) -> pd.DataFrame:
         """Trajectory and air data with their standard deviations: the columns of ``bet.csv`` (docs/bet-product.md)."""

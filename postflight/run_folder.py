@@ -487,7 +487,7 @@ def event_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
     """Events with the values of ``bet.csv`` there; the ``_3sd_`` columns hold three standard deviations."""
     air = flight.air
     named = [(name, t) for name, t in flight.telemetry.events if air.time_s[0] <= t <= air.time_s[-1]]
-    peak = "peak dynamic pressure" if flight.peak_is_inside else "largest dynamic pressure (edge of data)"
+    peak = f"largest dynamic pressure ({flight.peak_lies})" if flight.peak_lies else "peak dynamic pressure"
     named.append((peak, flight.peak_s))
     named += events.descent_events(air.time_s, air.altitude_m, air.mach)
     rows = []
@@ -527,6 +527,7 @@ def peak_table(flight: Reconstruction, table: pd.DataFrame) -> pd.DataFrame:
             continue
         k = int(np.flatnonzero(use)[np.argmax(size[use])])
         inside = 0 < k < len(size) - 1 and bool(use[k - 1] and use[k + 1])
+        inside &= name != "dynamic pressure" or not flight.peak_lies
         first = int(np.clip(k - 1, 0, len(size) - 3))
         near = slice(first, first + 3)
         at = events.find_peak(time_s[near], size[near])[0] if use[near].all() else time_s[k]

@@ -113,11 +113,11 @@ def reading_jump_checks(
 
     From reading to reading density follows the height, and what that may differ from the neighbours' course is limited:
     a layer cools upwards by ``g / c_p`` at most before it overturns, so that ``d ln rho`` differs by `_OVERTURNING` of
-    its usual self. A swing of three sd of the trim takes its sine's square from an axial force. A true step stays in
+    its usual self. A swing of the vehicle takes its sine's square from an axial force; one of as many sd of the trim as
+    the limit has is as rare as the limit. A true step stays in
     the median of the readings that follow: a single wild one does not, and is edited.
     """
     out = []
-    swing = np.sin(3.0 * trim_sd_rad) ** 2
     for number, instrument in enumerate(problem.instruments):
         rows = np.flatnonzero((problem.observed.source == number) & problem.observed.usable)
         if instrument.kind != DECELERATION:
@@ -138,6 +138,8 @@ def reading_jump_checks(
         own = step[k] - usual
         jump = np.where(own * lasting > 0.0, np.minimum(np.abs(own), np.abs(lasting)), 0.0)
         scatter = _NORMAL_MAD * np.median(np.abs(beside - usual[:, None]), axis=1)
+        most = float(-ndtri(0.5 * (1.0 - confidence) / len(k)))
+        swing = np.sin(min(most * trim_sd_rad, 0.5 * np.pi)) ** 2 / most
         sd = np.sqrt((_OVERTURNING * np.diff(air)[k]) ** 2 + swing**2 + 2.0 * noise[k] ** 2 + scatter**2)
         gap = np.lib.stride_tricks.sliding_window_view(np.diff(time_s), 2 * _NEIGHBOURS - 1).max(axis=1)
         whole = gap < _GAP_STEPS * np.median(np.diff(time_s))
@@ -149,7 +151,7 @@ def reading_jump_checks(
         out.append(
             consistency_check(
                 "reading-jump", f"reading jump {instrument.owner}", float(away[worst]), 0.0,
-                float(-ndtri(0.5 * (1.0 - confidence) / len(k))), f"{found}, as air may", found,
+                most, f"{found}, as air may", found,
                 advice="rows are missing and their times were closed up, a clock was set, the range was switched, or a "
                 "parachute opened or a part separated: correct the times, or leave out what follows by use_s",
                 source=instrument.owner, component=when,

@@ -512,6 +512,19 @@ def test_a_name_stands_once_and_a_sounding_has_no_spans(folder):
     )
 
 
+def test_a_sounding_may_reach_into_the_thermosphere(folder):
+    """417 K at 125 km, by the standard, were refused as no temperature of air; 417 K at 12.5 km still are."""
+    air = '[atmosphere]\nfile = "air.csv"'
+    for scale, refused in ((1.0, False), (0.1, True)):
+        z = np.arange(0.0, 180e3, 1e3)
+        columns = scale * z, *us76(z)[:2], 0 * z, 0 * z
+        folder.table("air.csv", "alt_m,rho_kgpm3,t_k,wind_n_mps,wind_e_mps", *columns)
+        if refused:
+            folder.refused([GNSS, BALLISTIC, air], "value-range", "temperature", kind=GateError)
+        else:
+            assert folder.read(GNSS, BALLISTIC, air).sounding.temperature_k[-1] > 500.0
+
+
 def test_video_needs_a_vehicle(folder):
     folder.refused(
         [GNSS, BALLISTIC, '[frames]\nfile = "gps.csv"\nfolder = "."'], "vehicle-missing", "frames", 'vehicle = "..."'

@@ -243,6 +243,17 @@ def test_an_accelerometer_at_the_end_of_its_range_shows_no_drag(tmp_path):
     assert (span.start_s, span.end_s) == pytest.approx((beyond[0], beyond[-1]), abs=1.0)
 
 
+@pytest.mark.parametrize(("gap_s", "inside"), [((-6.0, -0.5), False), ((0.5, 6.0), False), ((-6.0, -4.0), True)])
+def test_a_peak_at_a_gap_is_marked(tmp_path, gap_s, inside):
+    """There the drag is that of the stated air: the largest value lay in the gap, as a peak like any other."""
+    truth = mars_entry.fly(906, to_s=120.0)
+    first, last = truth.time_s[np.argmax(truth.axial_mps2)] + np.array(gap_s)
+    bet = pf.reconstruct(spoilt(truth, tmp_path, lambda rows: rows[(rows[:, 0] < first) | (rows[:, 0] > last)]))
+    rows = peak_table(bet, bet.to_frame()).set_index("peak")
+    assert (bet.peak_lies, rows.loc["dynamic pressure", "inside"]) == (("" if inside else "gap in the data"), inside)
+    assert not first < rows.loc["deceleration", "t_s"] < last
+
+
 @pytest.mark.parametrize("cut", [np.round, np.trunc, np.floor])
 def test_a_coarse_accelerometer_shows_its_least_count(tmp_path, cut):
     """Counts of 1 m/s^2, not stated, cut off: the speed was 9.6 sd wrong, all green."""
@@ -282,7 +293,7 @@ def test_a_deceleration_that_is_too_small_leaves_the_air_below_too_hot(tmp_path,
     assert bool(bet.suspects) == (not check.passed)
 
 
-@pytest.mark.parametrize("missing_s", [0.0, 3.0])
+@pytest.mark.parametrize("missing_s", [0.0, 1.0, 3.0])
 def test_rows_that_are_missing_and_whose_times_were_closed_up_are_red(tmp_path, missing_s):
     """Six seconds before the peak; the speed was 20 sd wrong, every check green."""
     truth = mars_entry.fly(917, to_s=120.0)
