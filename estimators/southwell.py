@@ -38,6 +38,7 @@ LEAST_SPANS = 4  # two on either side of the peak, for a line each
 _MOST_LOG_SD = 3.0  # of offset or margin: a factor of twenty
 CONFIDENCE = 0.90  # of the interval, as of the reconciliation's
 LEFT_OUT = 0.10  # sd of means against the static line, of the deflection at peak; elsewhere as the period, 1/sqrt(q)
+_LOG_BEYOND = (-27.0, 27.0)  # of the critical load over the largest, less one: a double has no more
 _MOST_LOADS = 50.0  # the stiffness of a joint this many times stiffer than its load is not observable
 
 
@@ -158,8 +159,9 @@ def southwell(
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
 
     def model(x: FloatArray) -> FloatArray:
-        u = pressure_pa / (top * (1.0 + np.exp(x[0])))
-        return np.asarray(np.exp(x[1]) * u / (1.0 - u))
+        # u / (1 - u), written without a difference that may be zero: that of the largest load to the critical one
+        to_critical = top - pressure_pa + top * np.exp(np.clip(x[0], *_LOG_BEYOND))
+        return np.asarray(np.exp(x[1]) * pressure_pa / to_critical)
 
     start = np.array([0.0, np.log(max(float(np.median(theta_rad)), 1e-4))])
     fit = least_squares(lambda x: whiten @ (model(x) - theta_rad), start, max_nfev=200)

@@ -109,3 +109,11 @@ def test_the_stiffness_of_a_stiff_joint_is_not_observable():
     with pytest.raises(DivergenceError) as refusal:
         southwell(q[:3], 1e-5 * q[:3], np.full(3, 1e-4))
     assert refusal.value.codes == ("too-few-spans",)
+
+
+def test_a_deflection_at_the_largest_load_alone_diverges_there_without_a_warning():
+    """The critical load came so near to the largest that their difference was zero: warnings in the user's terminal."""
+    q = 1e3 * np.array([50.143, 59.171, 59.957, 64.639, 64.848, 66.020, 69.008, 69.752, 77.468, 77.472, 90.182])
+    theta = 1e-6 * np.array([182.64, 197.10, 148.57, 145.18, 83.35, 27.39, 32.10, 36.63, 64.12, 14.41, 1511.17])
+    with pytest.raises(DivergenceError, match="not observable"):
+        southwell(q, theta, np.full(11, 1e-4))
