@@ -12,6 +12,7 @@ import numpy as np
 from estimators._edge_kernels import median
 from estimators._sight_kernels import COLUMNS, feet, project_edge, project_points, rotation_of
 from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
+from flightmodel.statistics import NORMAL_MAD
 
 JOINT = COLUMNS - 1
 LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
@@ -120,7 +121,7 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
                 if math.isfinite(residual[start + i]):
                     scaled[used] = abs(residual[start + i] - centre) / sd[i]
                     used += 1
-            inflate = max(1.4826 * median(scaled, used), 1.0)
+            inflate = max(NORMAL_MAD * median(scaled, used), 1.0)
         for i in range(size):
             weight[start + i] = 0.0
             if math.isfinite(residual[start + i]):

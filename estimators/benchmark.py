@@ -75,7 +75,7 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
-from flightmodel.statistics import mixture_moments, paired_covariance, symmetric_root
+from flightmodel.statistics import NORMAL_MAD, mixture_moments, paired_covariance, symmetric_root
 from flightmodel.vehicle import CameraMount, CameraUncertainty
 
 # orientation
@@ -438,7 +438,7 @@ def _look(
     if reach_px:
         # steps in the clouds behind the rim
         off = np.abs(residuals.residual_px)
-        scatter = 1.4826 * float(np.nanmedian(off)) if len(off) else 0.0
+        scatter = NORMAL_MAD * float(np.nanmedian(off)) if len(off) else 0.0
         residuals = residuals.some(off < np.clip(_WILD * scatter, *_WILD_PX))
         if not horizon.is_by_hand:
             residuals = residuals.some(is_coherent(residuals.index, residuals.residual_px))

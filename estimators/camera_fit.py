@@ -55,6 +55,7 @@ from estimators.frame_solution import (
 )
 from estimators.virtual_camera import DEFLECTION, RADIUS
 from flightmodel.checks import Fault, FloatArray
+from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 
@@ -421,8 +422,8 @@ class OrientedCamera(FrameModel):
         if agreed < _LEAST_AGREED:
             turned = _agreed_turned(fitted)
             return None, agreed, turned > _AGREED_TURNED and turned > agreed + _MORE_TURNED
-        scale = 1.4826 * float(np.nanmedian(off))
-        inflated = max(1.4826 * float(np.nanmedian(off / sharp[1][has])), 1.0)
+        scale = NORMAL_MAD * float(np.nanmedian(off))
+        inflated = max(NORMAL_MAD * float(np.nanmedian(off / sharp[1][has])), 1.0)
         rows = has[off < max(3.0 * scale, 0.3)]
         kept = np.full_like(sharp[1], np.inf)
         kept[rows] = TOGETHER * inflated * sharp[1][rows]
@@ -494,6 +495,6 @@ def _agreed_turned(fitted: Fitted) -> float:
     weight, rest = np.ones(len(left)), left
     for _ in range(_REWEIGHTED):
         rest = left - by @ np.linalg.lstsq(by * weight[:, None], left * weight, rcond=None)[0]
-        scale = max(1.4826 * float(np.median(np.abs(rest))), _AGREED_PX / 2.0)
+        scale = max(NORMAL_MAD * float(np.median(np.abs(rest))), _AGREED_PX / 2.0)
         weight = 1.0 / (1.0 + (rest / scale) ** 2)
     return float(np.mean(np.abs(rest) < _AGREED_PX))

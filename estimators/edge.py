@@ -42,6 +42,7 @@ from scipy.special import ndtr
 
 from estimators import _edge_kernels
 from flightmodel.checks import BoolArray, Fault, FloatArray
+from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 NO_FAULT = Fault("")
@@ -441,7 +442,7 @@ def second_edge(
     grey, inside = sampled(image, lines, round(2.0 * reach / STEP_PX) + 1)
     rise, first = np.empty((len(grey), grey.shape[1] - 2)), np.empty(len(grey))
     _edge_kernels.rises_over_pixel(grey, round(1.0 / STEP_PX), rise, first)
-    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * 1.4826 * middle_of(np.abs(rise)))
+    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * NORMAL_MAD * middle_of(np.abs(rise)))
     steps = np.empty(rise.shape, dtype=np.bool_)
     _edge_kernels.tops(rise, least, steps)
     whole = (first > 2.0 * least) & inside.all(axis=1)

@@ -48,6 +48,7 @@ from flightmodel.geometry import (
     torus_limb,
 )
 from flightmodel.rendering import Rendered, against, face_normals
+from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
@@ -389,7 +390,7 @@ def fit_feature_map(
     highest, where = max(found, key=lambda pair: pair[0])
     others = [maps[-1].score(pixels(p)) for p in starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))]
     usual = float(np.median(others))
-    scatter = 1.4826 * float(np.median(np.abs(np.array(others) - usual)))
+    scatter = NORMAL_MAD * float(np.median(np.abs(np.array(others) - usual)))
     return where if highest - usual > _LEAST_RISE * scatter else None
 
 

@@ -22,6 +22,7 @@ from estimators.features import Features
 from estimators.virtual_camera import FLATTENING, RADIUS, VirtualCamera
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
+from flightmodel.statistics import NORMAL_MAD
 
 HUBER = 2.5  # of the scatter: 1 % of normal residuals are beyond it
 WAVES, ROUND_WAVES = (2, 3, 4, 5), (2, 3)
@@ -165,7 +166,7 @@ def huber_gain(
     for group in (is_edge, ~is_edge):
         if group.any():
             centre = np.median(residual[group])
-            scale[group] *= max(1.4826 * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
+            scale[group] *= max(NORMAL_MAD * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
     weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale)) / together
     weighted = design.T * weight
     covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)

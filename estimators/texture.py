@@ -40,6 +40,7 @@ from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import circumferential, torus_circles
 from flightmodel.rendering import Rendered, against, face_normals
+from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 Picture = NDArray[np.float32]
@@ -275,7 +276,7 @@ def _spread_corners(image: Image, picture: Picture, mask: BoolArray) -> NDArray[
 def noise_of(image: Image) -> float:
     """Rms of a picture's noise from pixel to pixel, grey levels, by a mask that is blind to slopes and bends."""
     second = cv2.filter2D(image.astype(np.float32), cv2.CV_32F, np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32))
-    return 1.4826 * float(np.median(np.abs(second))) / 6.0
+    return NORMAL_MAD * float(np.median(np.abs(second))) / 6.0
 
 
 def _sharp_directions(template: Picture) -> tuple[FloatArray, float]:

@@ -21,6 +21,7 @@ from scipy.special import gammaincinv
 
 from flightmodel.checks import FloatArray
 
+NORMAL_MAD = 1.4826  # sd of a normal variable over the median of its absolute values
 KNOTS_A_LENGTH = 3  # of a Gauss-Markov history, in one correlation length
 BAND_PERCENTILES = (2.3, 50.0, 97.7)
 BAND_COLUMNS = tuple(f"p{p:g}" for p in BAND_PERCENTILES)

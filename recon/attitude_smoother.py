@@ -49,6 +49,7 @@ from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t, sun_direction_ecef
 from flightmodel.instruments import SunHeads, TriadSpec, direction_from_sun_angles, sun_angles_from_direction
+from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import SunRecord, TriadRecord
 from recon._measurement_kernels import SLOTS
 from recon.measurements import magnetometer_model, sun_model
@@ -692,5 +693,5 @@ def _edited(observed: VectorObservations, fit: Fit) -> VectorObservations:
     """Observations without the few that lie far from the fit."""
     line = linearise(observed, fit.q_eci_body, fit.rate_radps, fit.errors)
     off = np.abs(line.residual).max(axis=1) / observed.noise_sd
-    far = np.asarray(off > _EDIT_SD * max(1.0, 1.4826 * float(np.median(off))))
+    far = np.asarray(off > _EDIT_SD * max(1.0, NORMAL_MAD * float(np.median(off))))
     return observed.take(~far) if 0.0 < far.mean() <= _MOST_EDITED else observed

@@ -11,6 +11,7 @@ from scipy.special import ndtri
 
 from flightmodel import earth
 from flightmodel.checks import FloatArray
+from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Telemetry
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, consistency_check
@@ -22,7 +23,6 @@ _MOST_FELT = 3.0  # beyond it the drag hides a bias that the check should show
 _CLEARLY_FELT = 50.0  # times its noise: steps of a twentieth are then clear
 _NEIGHBOURS = 5  # readings before and after a step: a quarter of a second at the rate of block means
 _GAP_STEPS = 2.5
-_NORMAL_MAD = 1.4826  # sd of a normal variable over its median absolute deviation
 _OVERTURNING = 2.0 / 7.0  # (gamma - 1) / gamma of a gas of two atoms; carbon dioxide has 0.25
 _STRONG = 0.95  # quantile of readings that is a peak, beside wild ones
 
@@ -137,7 +137,7 @@ def reading_jump_checks(
         lasting = medians[k + 1] - medians[k + 1 - _NEIGHBOURS] - _NEIGHBOURS * usual
         own = step[k] - usual
         jump = np.where(own * lasting > 0.0, np.minimum(np.abs(own), np.abs(lasting)), 0.0)
-        scatter = _NORMAL_MAD * np.median(np.abs(beside - usual[:, None]), axis=1)
+        scatter = NORMAL_MAD * np.median(np.abs(beside - usual[:, None]), axis=1)
         most = float(-ndtri(0.5 * (1.0 - confidence) / len(k)))
         swing = np.sin(min(most * trim_sd_rad, 0.5 * np.pi)) ** 2 / most
         sd = np.sqrt((_OVERTURNING * np.diff(air)[k]) ** 2 + swing**2 + 2.0 * noise[k] ** 2 + scatter**2)

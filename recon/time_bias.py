@@ -29,6 +29,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Finding, TriadRecord
 from flightmodel.trajectory import interpolate_rows
 from recon.consistency import ConsistencyCheck, consistency_check
@@ -139,7 +140,7 @@ def _combined(lags: FloatArray) -> Lag:
     order = np.argsort(lag)
     share = np.cumsum(weight[order]) / weight.sum()
     middle = float(lag[order][int(np.searchsorted(share, 0.5))])
-    scatter = max(1.0, 1.4826 * float(np.median(np.abs(lag - middle) * np.sqrt(weight))))
+    scatter = max(1.0, NORMAL_MAD * float(np.median(np.abs(lag - middle) * np.sqrt(weight))))
     common = float(damping @ weight / weight.sum())  # windows share it
     return Lag(middle, float(np.hypot(1.25 * scatter / np.sqrt(weight.sum()), common)))
 
