@@ -318,11 +318,13 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     Raises
     ------
     GateError
-        Where there is no fused deflection, or the increments do not settle.
+        Where the answers are of another trajectory, there is no fused deflection, or the increments do not settle.
     """
     check_type("aero_increments", bet, Reconstruction, RECONSTRUCT)
     found = fuse(bet) if answers is None else answers
     check_type("aero_increments: answers", found, Deflections, "pf.fuse(bet)")
+    if found.bet is not bet:
+        raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "answers-of-another")
     if found.fused is None:
         raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
     return increments_of(found.fused, bet.solution.settings.check_confidence, bet.telemetry.name)

@@ -16,6 +16,7 @@ from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.flown_coefficients import TABLE, increments_of
 from postflight.fusing import fuse_flight
 from postflight.plots.deflection import figure_increments
+from postflight.reconstruction import Reconstruction
 from postflight.run_folder import increments_summary
 from tests.estimators.conftest import VEHICLE
 from tests.estimators.test_increments import PROCESSES, SD, flown, flown_with
@@ -111,12 +112,16 @@ def test_a_table_that_is_wrong_turns_red_and_is_named(k, name):
 
 
 def test_answers_carry_increments_or_why_there_are_none():
-    none = Deflections(refused={"fused": Fault("no loads", "loads-missing")})
+    bet = object.__new__(Reconstruction)
+    none = Deflections(bet=bet, refused={"fused": Fault("no loads", "loads-missing")})
     assert with_increments(none) is none
     assert increments_summary(none) is None
     with pytest.raises(GateError) as refused:
-        aero_increments(None, none)
+        aero_increments(bet, none)
     assert refused.value.codes == ("loads-missing",)
+    with pytest.raises(GateError) as refused:
+        aero_increments(object.__new__(Reconstruction), none)
+    assert refused.value.codes == ("answers-of-another",)
     why = Fault("they do not settle", "increments-not-converged")
     assert increments_summary(replace(none, no_increments=why))["code"] == why.code
     whole = replace(none, fused=answer(), increments=found())
