@@ -58,6 +58,7 @@ _NOT_THE_SHELL = (
 _PAINTED, _LEAST_PAINTED = 0.25, 3
 _LEAST_MIXED, _MIXED = 2, 0.05  # frames with two edges, of which 670 sound ones show none; and of all
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
+_EDGE_FOR_PLANE = 0.5  # of the edge in the benchmark frame: a frame needs half as much, found in both
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
@@ -317,6 +318,12 @@ def read_film(
         raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
     benchmark_s = float(times[nearest])
     fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
+    if axis is not None and all(fit.refused for fit in fits) and oriented.edge_in_view < _EDGE_FOR_PLANE:
+        raise GateError(
+            f"camera: no frame can be read in an assumed plane, where the edge alone counts: the benchmark frame shows "
+            f"{100.0 * oriented.edge_in_view:.0f} % of it. Leave the plane open (no camera_plane_lv_deg, no --plane)",
+            code="plane-needs-edge",
+        )
     remarks = [f"by hand: {edits}"] if edits.rows else []
     if fixed is not None:
         remarks.append(f"text burnt into the film, or dead lines: {100.0 * fixed.mean():.0f} % of the picture left out")

@@ -116,6 +116,11 @@ _FORCE_NAMES = (
 # vehicle that pitches and spins faster. At least some samples must lie in it
 _HALF_WINDOW_S, _MOST_TURN_RAD, _LEAST_SAMPLES = 0.02, 0.31, 2.5
 _RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
+_CODE = "trajectory-diverged"
+_DIVERGED = (
+    "Check planet, [start.state] and its time, the accelerometer's and gyros' units, signs and mounting, and the "
+    "attitude prior; `postflight check` compares them"
+)
 _EDGE_S = 1.0  # from data's end, or a gap's, within which a largest value is not taken for a peak
 _NO_READINGS = ("data-gap", "samples-missing", "frozen-data")
 # why the check is not independent, by code
@@ -294,7 +299,12 @@ def reconstruct(flight: Flight, settings: Settings | None = None, progress: Prog
         check_type("reconstruct: settings", settings, Settings, "pf.Settings(...)")
         flight = replace(flight, settings=settings)
     report(0.0, "reconstructing")
-    solution = solve(flight.telemetry, flight.settings, lambda f, what: report(0.95 * f, what))
+    try:
+        solution = solve(flight.telemetry, flight.settings, lambda f, what: report(0.95 * f, what))
+    except GateError as fault:
+        if "not-finite" in fault.codes:  # of a path: telemetry that is not finite does not pass its reader
+            raise DivergenceError(f"reconstruction: diverged beyond all numbers. {_DIVERGED}", _CODE) from None
+        raise
     report(0.95, "checking the attitude")
     attitude = check_attitude(flight.telemetry, solution)
     report(0.97, "finding the as-flown atmosphere")
@@ -372,9 +382,8 @@ def _check_inside_tables(trajectory: Trajectory) -> None:
         k = int(np.argmax(wrong))
         raise DivergenceError(
             f"reconstruction: diverged: at {trajectory.time_s[k]:.1f} s the altitude is {altitude_m[k] / 1000:.1f} km. "
-            "Check planet, [start.state] and its time, the accelerometer's and gyros' units, signs and mounting, and "
-            "the attitude prior",
-            "trajectory-diverged",
+            f"{_DIVERGED}",
+            _CODE,
         )
 
 

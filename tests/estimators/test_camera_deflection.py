@@ -12,13 +12,14 @@ import pytest
 import flightmodel
 from estimators.benchmark import orient_camera, with_deflected_benchmark
 from estimators.camera import polar, read_film, sensitivity_table
-from estimators.camera_fit import REACH_PX
-from estimators.edge import HorizonLine, find_horizon, steps_near
+from estimators.camera_fit import REACH_PX, OrientedCamera
+from estimators.edge import HorizonLine, find_horizon, no_horizon, steps_near
 from estimators.frame_residuals import light_columns
+from estimators.frame_solution import refused_fit
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
-from flightmodel.checks import GateError
+from flightmodel.checks import Fault, GateError
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, dot_positions
 from flightmodel.vehicle import CameraMount
@@ -318,6 +319,20 @@ def test_without_an_edge_in_the_benchmark_frame_no_edge_is_a_share_of_it(monkeyp
     assert oriented._edge_share(120) == pytest.approx(0.5, abs=0.05)
     monkeypatch.setitem(oriented.__dict__, "_benchmark_edge", np.zeros(3, dtype=bool))
     assert oriented._edge_share(120) == 0.0
+
+
+def test_an_assumed_plane_without_edge_is_refused_by_its_reason(monkeypatch):
+    """In it the edge alone counts: features can carry a film of which the rim is hidden, but not in a stated plane."""
+    none = Fault("too few points", "edge-points-too-few")
+    monkeypatch.setattr(OrientedCamera, "fit", lambda *_: refused_fit(no_horizon(none), none))
+    monkeypatch.setattr(OrientedCamera, "edge_in_view", 0.25)
+    frames, times = film(4, [0.0, 3.0], [0.0, 175.0]), np.array([421.0, 440.0])
+    with pytest.raises(GateError) as refused:
+        read_film(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=D(175.0))
+    assert refused.value.codes == ("plane-needs-edge",)
+    assert all(fit.refused for fit in read_film(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=None).fits)
+    monkeypatch.setattr(OrientedCamera, "edge_in_view", 0.9)
+    assert all(fit.refused for fit in read_film(times, frames, GEOMETRY, MOUNT, JOINT_M, plane_lv_rad=D(175.0)).fits)
 
 
 def test_a_wrong_lens_is_refused():

@@ -216,6 +216,17 @@ def test_settings_and_answers_are_of_their_types(bet, flight):
         assert fault.value.codes == ("argument-type",)
 
 
+def test_a_path_beyond_all_numbers_is_a_divergence_and_says_what_to_check(flight, monkeypatch):
+    def lost(*_):
+        raise pf.GateError("position_ecef_m: 3 values are not finite", "not-finite")
+
+    monkeypatch.setattr("postflight.reconstruction.solve", lost)
+    with pytest.raises(pf.GateError) as fault:
+        pf.reconstruct(flight)
+    assert fault.value.codes == ("trajectory-diverged",)
+    assert "postflight check" in str(fault.value)
+
+
 def test_two_looks_side_by_side(bet, answer, flight):
     same = pf.compare(answer, answer).to_frame()
     assert same["difference"].abs().max() < 1e-9  # an attitude against itself is zero to rounding
