@@ -188,7 +188,7 @@ def _not_carried(found: tuple[UnmodelledAcceleration, ...]) -> DivergenceError:
     return DivergenceError(
         f"reconstruction: unmodelled accelerations in more than {MOST_SPANS} spans between {start:.1f} and {end:.1f} "
         "s: accelerometer and gyros do not carry the track. Run `postflight check`; check attitude_prior (q_ecef_body "
-        "is scalar first and maps body vectors to ECEF), units, axes and mounting of both sensors, and t0_utc. State "
-        "spans of heavy vibration in [[motion.disturbed]]",
+        "is scalar first and maps body vectors to ECEF), units, axes and mounting of both sensors, all time tags and "
+        "t0_utc. State spans of heavy vibration in [[motion.disturbed]]",
         code="track-not-followed",
     )
