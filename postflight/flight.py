@@ -26,6 +26,7 @@ from recon.settings import Settings
 READ = "pf.read_flight(folder)"
 RECONSTRUCT = "pf.reconstruct(flight)"
 PULSE_RATE_HZ = 50.0
+_ON_TOP = ("c_a", "c_n", "c_m", "cg_shift_body_m", "density", "wind")  # what acts on earlier changes
 SETTINGS = {f.name for f in fields(Settings)}
 
 
@@ -80,6 +81,9 @@ class Flight(Tabular):
     def with_(self, **changes: Any) -> Flight:
         """Return a flight in which these assumptions differ.
 
+        Factors and shifts act on those of earlier changes: ``with_(c_n=1.2).with_(c_n=1.0)`` has 1.2. All else is
+        replaced.
+
         Parameters
         ----------
         c_a, c_n, c_m : float
@@ -112,7 +116,8 @@ class Flight(Tabular):
         faults: list[str] = []
         for name, value in changes.items():
             try:
-                flight = replace(_changed(flight, name, value), changes=(*flight.changes, f"{name} = {value}"))
+                kept = [c for c in flight.changes if name in _ON_TOP or not c.startswith(f"{name} = ")]
+                flight = replace(_changed(flight, name, value), changes=(*kept, f"{name} = {value}"))
             except GateError as fault:
                 faults += fault.faults
         try:

@@ -201,7 +201,7 @@ def test_a_command_leaves_out_more_and_writes_at_another_rate_without_a_what_if(
     asked = commands.asked(("c_n=1.1", "wind=none"), (second,), 5.0).of(stated)
     assert asked.settings.without == (first, second)
     assert asked.settings.output_rate_hz == 5.0
-    assert asked.changes[1:3] == ("c_n = 1.1", "wind = None")
+    assert asked.changes == ("c_n = 1.1", "wind = None", f"without = {(first, second)}")
     assert commands.asked((), (), 5.0).of(flight).changes == ()
     assert commands.asked((f"without={first}",), (second,), None).of(flight).settings.without == (first, second)
     with pytest.raises(ConfigError) as refusal:
@@ -225,6 +225,13 @@ def test_a_path_beyond_all_numbers_is_a_divergence_and_says_what_to_check(flight
         pf.reconstruct(flight)
     assert fault.value.codes == ("trajectory-diverged",)
     assert "postflight check" in str(fault.value)
+
+
+def test_a_change_that_replaces_another_is_named_alone(flight):
+    twice = flight.with_(output_rate_hz=5.0, c_n=1.2).with_(output_rate_hz=2.0, c_n=1.5)
+    assert twice.changes == ("c_n = 1.2", "output_rate_hz = 2.0", "c_n = 1.5")
+    assert twice.settings.output_rate_hz == 2.0
+    assert twice.vehicle.aero.at(5.0, 0.1)[1] == pytest.approx(1.8 * flight.vehicle.aero.at(5.0, 0.1)[1])
 
 
 def test_two_looks_side_by_side(bet, answer, flight):
