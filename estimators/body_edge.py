@@ -1,4 +1,4 @@
-"""Did the camera move in its mount since the benchmark frame? The centerbody's own edge in the picture tells.
+"""Did the camera move in its mount since the benchmark frame? The centerbody's own edge in the picture shows it.
 
 The camera sits on the centerbody, whose silhouette lies in every picture where it lies in the benchmark frame, whatever
 the shell does; a turn, a zoom or a picture that was moved shifts it. Across its expected place the first lasting step
@@ -46,7 +46,7 @@ class BodyEdge:
     place_px: FloatArray
 
     def moved_px(self, picture: KeptPicture, clear: BoolArray) -> float:
-        """How far the edge has moved since (median); zero where it has not, NaN where nothing tells.
+        """How far the edge has moved since (median); zero where it has not, NaN where the picture does not show it.
 
         ``clear`` (n,): lines that nothing hides.
         """

@@ -247,7 +247,7 @@ class OrientedCamera(FrameModel):
             )
 
     def _mount_px(self, frame: EditedFrame) -> float:
-        """How far the camera has moved in its mount, by `estimators.body_edge`; NaN where nothing tells."""
+        """How far the camera has moved in its mount, by `estimators.body_edge`; NaN where unknown."""
         if self.body is None:
             return float("nan")
         return self.body.moved_px(frame.kept, frame.is_clear(self.body.lines.origin_px))

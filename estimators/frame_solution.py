@@ -131,7 +131,7 @@ class FrameFit:
     doubled : float
         Share of edge points that agree on a second edge; zero if usual.
     mount_px : float
-        How far the centerbody's own edge has moved in the picture; NaN where nothing tells.
+        How far the centerbody's own edge has moved in the picture; NaN where unknown.
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None

@@ -52,7 +52,7 @@ class Rest:
         Frames with little load, or on the quieter side; 0: none.
     span_s : tuple of float
         First and last of them, or the benchmark frame's time twice.
-    knows_load : bool
+    load_is_known : bool
     """
 
     theta_rad: float
@@ -60,7 +60,7 @@ class Rest:
     limit: float
     frames: int
     span_s: tuple[float, float]
-    knows_load: bool = True
+    load_is_known: bool = True
 
     @property
     def passed(self) -> bool:
@@ -75,7 +75,7 @@ class Rest:
             found = f"the benchmark frame's load deflects the shell by about {size:.2f} deg, and no frame has less"
             return found if self.passed else f"{found}: state another benchmark_s, of a frame with little load"
         first, last = self.span_s
-        if not self.knows_load:
+        if not self.load_is_known:
             found = f"{self.frames} frames on one side of the benchmark frame ({first:.2f} to {last:.2f} s) show "
             if self.passed:
                 return f"{found}the shell at rest"
@@ -156,7 +156,7 @@ def _by_sides(
         limit = float(np.sqrt(chi_square_quantile(1.0 - (1.0 - CONFIDENCE) / len(rows), 2)))
         size, over_sd = float(np.linalg.norm(theta[rows[worst]])), float(np.sqrt(square[worst]))
         span = float(time_s[rows[0]]), float(time_s[rows[-1]])
-        found.append(Rest(size, over_sd, limit, len(rows), span, knows_load=False))
+        found.append(Rest(size, over_sd, limit, len(rows), span, load_is_known=False))
     return min(found, key=lambda one: one.over_sd / one.limit)
 
 

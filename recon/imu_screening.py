@@ -43,6 +43,7 @@ from scipy.special import erf
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
 from flightmodel.gate import runs
 from flightmodel.instruments import TriadSpec
+from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Finding, TriadRecord
 
 _SLOPE_SPAN_S = 0.06  # over which a signal beside a gap is straight: a seventh of a period at 2.5 Hz
@@ -419,8 +420,8 @@ def _jumps(time_s: FloatArray, column: FloatArray, noise_sd: float) -> tuple[Flo
         size[_REACH - 1 : n - _REACH] += w * (
             column[_REACH + i : n - _REACH + 1 + i] - column[_REACH - 1 - i : n - _REACH - i]
         )
-    usual = 1.4826 * median_filter(np.abs(size), size=min(_NEARBY, len(size)), mode="nearest")
-    beside = 1.4826 * median_filter(np.abs(size), size=min(_BESIDE, len(size)), mode="nearest")
+    usual = NORMAL_MAD * median_filter(np.abs(size), size=min(_NEARBY, len(size)), mode="nearest")
+    beside = NORMAL_MAD * median_filter(np.abs(size), size=min(_BESIDE, len(size)), mode="nearest")
     k, away = np.arange(len(size)), _REACH + _BESIDE // 2 + 1
     for there in (np.maximum(k - away, 0), np.minimum(k + away, len(size) - 1)):
         usual = np.maximum(usual, beside[there])  # where vibration begins, all are jumps

@@ -380,8 +380,8 @@ def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     return (
         consistency_check(
             "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
-            "finer integration steps move no estimate", f"finer integration steps move {name}", advice=JOINT_WORDS,
-            component=name,
+            "finer integration steps move no estimate", f"finer integration steps move {name}",
+            advice="the fit's own steps are too long for this motion: its intervals do not hold", component=name,
         ),
     )  # fmt: skip
 

@@ -383,7 +383,7 @@ class WindowSteps:
 
 
 SLOW_JOINT, FAST_JOINT = WindowSteps(2, 2), WindowSteps(4, 2)
-FINE = WindowSteps(4, 8)  # resolve the joint's twist too: halved once more they move no estimate by 0.1 sd
+FINE = WindowSteps(4, 8)  # resolve the joint's twist too: twice as long they leave half a sd of the damping
 FAST_HZ = 6.0  # a window's mean of a faster oscillation is off by more than half a percent with two intervals
 
 

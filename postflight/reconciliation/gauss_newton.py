@@ -303,6 +303,7 @@ class Problem:
         return replace(flown, windows=flown.windows + self.step_error.windows, end=end)
 
     def _flown(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
+        """Spans of several parameters by the problem's own steps."""
         spans = self.measured.spans
         number = np.repeat(np.arange(len(trials)), spans)
         air, *others = [self.air.table(u.air, u.warmer_k) for u in trials]
