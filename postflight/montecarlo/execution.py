@@ -51,7 +51,6 @@ Job = tuple[int, Sequence[int]]
 Done = tuple[int, Chunk]
 AHEAD = 2  # chunks queued a worker: none waits, and results do not pile up
 CONNECT_S = 20
-END_S = 5.0  # to wait for a terminated worker process
 
 
 def fly_chunk(study: Study, job: Job) -> Done:
@@ -127,12 +126,11 @@ def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]
             code="worker-killed",
         ) from None
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        ours = [process for process in multiprocessing.active_children() if process not in begun]
-        for process in ours:
-            process.terminate()
-        for process in ours:
-            process.join(END_S)
+        for process in multiprocessing.active_children():
+            if process not in begun:
+                process.terminate()
+        # waits for the pool's own thread too: one that still ends while Python does closes a pipe that Python writes to
+        pool.shutdown(cancel_futures=True)
 
 
 def is_open(address: str) -> bool:

@@ -1,10 +1,12 @@
 """A study's numbers come from its runs alone: any workers, any kill, any resume; folders refuse what does not fit."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from functools import partial
@@ -27,7 +29,7 @@ from postflight.montecarlo.bands import (
     read_chunk,
     write_merged,
 )
-from postflight.montecarlo.execution import Wanted, status, study_of
+from postflight.montecarlo.execution import Wanted, fly_jobs, status, study_of
 from postflight.montecarlo.study import METHODS, TRIAL_SCALARS, Stop, read_study, run_trials, whole_trial
 from synthetic_flight import ensemble
 from tests.refusing import refuses
@@ -134,6 +136,18 @@ def test_control_c_leaves_a_folder_that_goes_on(study_path, tmp_path):
     assert 3 <= found.chunks < found.chunks_wanted
     fly(study_path, folder, flights=flights)
     assert status(folder).flights == flights
+
+
+@pytest.mark.slow
+def test_a_stopped_study_leaves_no_thread_or_process(study_path):
+    """A thread of the pool that outlives it may end while Python does, with a traceback on the screen."""
+    threads, processes = set(threading.enumerate()), set(multiprocessing.active_children())
+    jobs = [(number, range(4 * number, 4 * number + 4)) for number in range(24)]
+    flying = fly_jobs(read_study(str(study_path)), jobs, 2, None)
+    next(flying)
+    flying.close()
+    assert set(threading.enumerate()) <= threads
+    assert set(multiprocessing.active_children()) <= processes
 
 
 def test_a_longer_study_keeps_what_was_flown(reference, study_path, tmp_path):
