@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solveh_banded
 from scipy.linalg.lapack import dpotri
-from scipy.optimize import minimize_scalar
 from scipy.sparse import coo_array, csr_array, dia_array, eye_array, kron
 
 from estimators.evidence import Deflection
@@ -258,6 +257,7 @@ class NormalEquations:
 
     def process_size(self) -> float:
         """Most probable size of the process, rad/s^2, of the deflection's block alone."""
+        from scipy.optimize import minimize_scalar  # a tenth of a second
 
         def surprise(log_size: float) -> float:
             size = float(np.exp(log_size))

@@ -38,7 +38,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from estimators.balance import Swing
@@ -180,6 +179,7 @@ def delayed(loads: FlightLoads, force_s: float, rate_s: float) -> FlightLoads:
     t = loads.time_s
     if force_s == rate_s == 0.0 or len(t) < 2:
         return loads
+    from scipy.interpolate import CubicSpline  # a fifth of a second to import, for those who fuse alone
 
     def later(values: FloatArray, late_s: float) -> FloatArray:
         return values if late_s == 0.0 else np.asarray(values + late_s * CubicSpline(t, values)(t, 1))

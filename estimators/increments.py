@@ -37,7 +37,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array, diags_array
 
 from estimators.balance import Swing, axial_residual
@@ -231,6 +230,8 @@ def _instantaneous(reader: LoadsReader) -> LoadsReader:
     even, h = reader.smooth, reader.pulse.half_window_s
     if h == 0.0:
         return reader
+    from scipy.interpolate import CubicSpline  # a fifth of a second to import
+
     variance = {
         "specific_force_body_mps2": h**2 / 3.0,
         "rate_body_radps": h**2 / 3.0,

@@ -26,7 +26,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.special import ndtri
 
 from estimators.evidence import CONSTANT_PART
@@ -152,6 +151,8 @@ def southwell(
         raise DivergenceError(
             f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are needed", code="too-few-spans"
         )
+    from scipy.optimize import least_squares  # a tenth of a second, for whoever never fits
+
     constant = np.sqrt(CONSTANT_PART) * theta_sd_rad
     top = float(pressure_pa.max())
     neglected = (LEFT_OUT * theta_rad) ** 2 * top / pressure_pa

@@ -206,11 +206,13 @@ def instrument_of(
     known = np.zeros((len(value), 3)) if known is None else known
     value = np.where(np.isfinite(value), value, 0.0)
     spacing = np.zeros((len(value), 1)) if spacing_s is None else spacing_s
-    alike, member = np.unique(spacing, axis=1, return_inverse=True)
-    row, group = np.divmod(np.arange(len(value) * alike.shape[1]), alike.shape[1])
+    columns = [tuple(column) for column in spacing.T.tolist()]
+    groups = sorted(set(columns))
+    alike, member = np.array(groups).T, np.array([groups.index(column) for column in columns])
+    row, group = np.divmod(np.arange(len(value) * len(groups)), len(groups))
     variance = variance[row]
-    if alike.shape[1] > 1:
-        variance[member.ravel() != group[:, None]] = np.inf
+    if len(groups) > 1:
+        variance[member != group[:, None]] = np.inf
     keep = np.isfinite(variance).any(axis=1)
     row, group = row[keep], group[keep]
     return Instrument(

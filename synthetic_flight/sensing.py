@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.constants import speed_of_light
-from scipy.interpolate import CubicHermiteSpline
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
@@ -197,6 +196,8 @@ def sense_gnss(
     """
     at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
     size = {key: values[0] for key, values in GNSS.from_scenario(spec).items()}
+    from scipy.interpolate import CubicHermiteSpline  # a fifth of a second, for commands that do not simulate
+
     late = size["time_bias_sd_s"] * rng.standard_normal()
     seen_at = np.clip(at - late, truth.time_s[0], truth.time_s[-1])
     path, arm = truth.trajectory, np.array(spec.antenna_from_datum_body_m)
@@ -300,6 +301,8 @@ def echo(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
 
     With ``transit_time`` it shows the vehicle where it was hit, ``R / c`` earlier.
     """
+    from scipy.interpolate import CubicHermiteSpline  # a fifth of a second
+
     if spec.tracks == "cg":
         path = CubicHermiteSpline(truth.time_s, truth.state_eci[:, 0:3], truth.state_eci[:, 3:6])
     else:
