@@ -29,6 +29,7 @@ _TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 600
 _BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
 _DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
 _NO_ACCELEROMETER = "The flight has no accelerometer."
+_NO_GYROS = "Its accelerometer serves as a deceleration along the path; without gyros no force has known axes."
 _NO_ATTITUDE = "No inertial sensors carried the attitude, so the angle of attack is not known."
 NO_DEFLECTION = "No method gave a deflection; the reasons stand on the cards above."
 
@@ -52,7 +53,7 @@ _TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | No
         ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", AXES["y"], []),
         ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", AXES["z"], [6, 3])]),
 ]  # fmt: skip
-_WHY_ABSENT = {"alpha": _NO_ATTITUDE, "axial": _NO_ACCELEROMETER, "lateral": _NO_ACCELEROMETER}
+_FORCES = ("axial", "lateral")  # panels of the accelerometer
 _FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 
 
@@ -87,6 +88,8 @@ def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str
     """Panels of the trajectory, and id, title and reason of those that the flight has no data for."""
     bet = run.tables["bet"].iloc[rows]
     raw = {"altitude": _tracker_heights(run)} | _raw_accelerations(run)
+    no_force = _NO_ACCELEROMETER if run.telemetry.accelerometer is None else _NO_GYROS
+    why_absent = {"alpha": _NO_ATTITUDE} | dict.fromkeys(_FORCES, no_force)
     panels, absent = [], []
     for name, title, unit, scale, decimals, drawn in _TRAJECTORY:
         lines = []
@@ -97,7 +100,7 @@ def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str
         if lines:
             panels.append(panel_of(name, title, unit, "bet", lines, raw.get(name, [])))
         else:
-            absent.append((name, title, _WHY_ABSENT.get(name, "The run's table holds no value of it.")))
+            absent.append((name, title, why_absent.get(name, "The run's table holds no value of it.")))
     return panels, absent
 
 

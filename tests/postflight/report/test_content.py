@@ -18,6 +18,7 @@ from flightmodel.deflection import lv_clock
 from postflight.plots.style import COLOUR, with_holes
 from postflight.report import pictures
 from postflight.report import text as texts
+from postflight.report.panels import trajectory_panels, trajectory_rows
 from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
 from tests.postflight.report.conftest import HOSTILE
@@ -235,6 +236,19 @@ def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
     assert text.count('class="card none') == 4
     assert {card["reason"] for card in texts.cards(run)} == {m["reason"] for m in run.summary["methods"].values()}
     assert data["first"] == data["span"]
+
+
+def test_an_accelerometer_without_gyros_is_not_called_absent(rocket: Path, run) -> None:
+    """A deceleration carries the flight, and no force stands in body axes."""
+    without = read_run(rocket)
+    sensed = replace(without, telemetry=replace(without.telemetry, accelerometer=run.telemetry.accelerometer))
+    rows = trajectory_rows(without)
+    one, other = (
+        {name: why for name, _, why in trajectory_panels(flown, rows)[1] if name in ("axial", "lateral")}
+        for flown in (without, sensed)
+    )
+    assert one.keys() == other.keys() == {"axial", "lateral"}
+    assert all(one[name] != other[name] for name in one)
 
 
 def test_run_of_the_trajectory_alone(run) -> None:
