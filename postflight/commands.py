@@ -407,6 +407,8 @@ def print_sensitivity(found: pd.DataFrame) -> None:
 
 def print_answers(answers: Deflections) -> None:
     """Deflection method by method at peak dynamic pressure; without a trajectory at the largest."""
+    if answers.doubt:
+        console.coded("[red]in doubt[/]", answers.doubt, "answers-in-doubt")
     at_s = answers.reference_s
     cycle = answers.cycle_s
     parts = [] if cycle is None else [f"mean over the cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s"]

@@ -20,7 +20,7 @@ from postflight.flown_coefficients import AeroIncrements, increments_of
 from postflight.fusing import CameraTimeBias, FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
-from recon.consistency import ConsistencyCheck
+from recon.consistency import ConsistencyCheck, doubt
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
@@ -117,6 +117,13 @@ class Deflections(Tabular):
         name, words = "deflection methods have a common answer", str(reason)
         return (*of_cameras, ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
 
+    @property
+    def doubt(self) -> str:
+        """What the failed checks of trajectory, air and deflection mean for the answers; empty where all pass."""
+        of_bet = () if self.bet is None else self.bet.consistency_checks
+        checks = (*of_bet, *self.consistency_checks)
+        return doubt([check.name for check in checks if not check.passed], len(checks))
+
     def to_frame(self) -> pd.DataFrame:
         """One row a method, at `reference_s`.
 
@@ -151,7 +158,8 @@ class Deflections(Tabular):
             f"{method} {np.rad2deg(theta):.2f} +/- {np.rad2deg(sd):.2f} deg"
             for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.continuous.items())
         ]
-        return f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
+        answers = f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
+        return f"{self.doubt}; {answers}" if self.doubt else answers
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:

@@ -50,7 +50,7 @@ from recon.atmosphere import (
     too_sparse,
     windows_are_whole,
 )
-from recon.consistency import ConsistencyCheck
+from recon.consistency import ConsistencyCheck, doubt
 from recon.entry_density import (
     density_by_drag,
     density_check,
@@ -269,9 +269,11 @@ class Reconstruction(Tabular):
 
     def _about(self) -> str:
         checks = self.consistency_checks
-        passed = f"{sum(c.passed for c in checks)} of {len(checks)} consistency checks pass"
+        doubtful = doubt([c.name for c in checks if not c.passed], len(checks))
         peak = f"peak q {self.air.dynamic_pressure_pa.max():.0f} Pa at {self.peak_s:.2f} s"
-        return "; ".join((self.flight.name, peak, passed, *self.flight.changes))
+        passed = f"all {len(checks)} consistency checks pass"
+        parts = (doubtful, self.flight.name, peak, *(() if doubtful else (passed,)), *self.flight.changes)
+        return "; ".join(filter(None, parts))
 
 
 @on_one_thread

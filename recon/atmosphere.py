@@ -64,8 +64,15 @@ _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
 # coefficients (ranges, tunnels, CFD) change from one to the next; assumed
 CA_SHAPE_LENGTH = float(np.log(2.0))
 _KNOT_LOG_MACH, _LEAST_MACH = 0.1, 0.1
-_BAD_AIR = "is beyond the sounding's uncertainty: the air differed from the sounding, or the drag coefficient is wrong"
-_BAD_DRAG = "is beyond the pre-flight uncertainty: check mass, area and coefficients"
+_BAD_DENSITY = (
+    "is beyond the sounding's uncertainty: density, C_A, area or mass is wrong, which the drag does not separate; "
+    "check the vehicle file and the sounding"
+)
+_BAD_WIND = "is beyond the sounding's uncertainty: the winds differed from the sounding, or C_N of the vehicle is wrong"
+_BAD_DRAG = (
+    "is beyond the pre-flight uncertainty: C_A, area, mass or density is wrong, which the drag does not separate; "
+    "check the vehicle file and the sounding"
+)
 _LARGEST_RMS = 2.0
 _LEAST_STIFFNESS = 0.1  # share of the joint's stiffness that aerodynamic load leaves
 _CONVERGED_SD, _MOST_STEPS = 1e-2, 20  # far below any error; a bound
@@ -448,8 +455,8 @@ def _consistency_checks(
     density, winds = slice(0, k), slice(k, 3 * k)
     names = [f"density {h}" for h in heights]
     checks = (
-        check("sounding-density", "sounding density", names, estimate[density], sd[density], _BAD_AIR),
-        check("sounding-wind", "sounding wind", wind, estimate[winds], sd[winds], _BAD_AIR),
+        check("sounding-density", "sounding density", names, estimate[density], sd[density], _BAD_DENSITY),
+        check("sounding-wind", "sounding wind", wind, estimate[winds], sd[winds], _BAD_WIND),
         # C_N is not checked: a deflected aeroshell changes the normal force as a wrong C_N does
         check("pre-flight-ca", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
     )

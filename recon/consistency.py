@@ -30,7 +30,7 @@ S. McReynolds, "Editing data using sequential smoothing techniques for discrete 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,13 +55,18 @@ _MOST_PREDICTED = 4000  # held-out measurements; more are thinned evenly
 _COLUMNS = ("time_s", "source", "component", "residual", "predicted_sd")
 # code, name and advice for the a priori errors of a ballistic flight's air and vehicle
 _BALLISTIC_CHECKS = {
-    "air": ("sounding", "sounding", "is beyond the sounding's uncertainty: check its units, its time and place"),
+    "air": (
+        "sounding",
+        "sounding",
+        "is beyond the sounding's uncertainty: check its units, time and place, and the vehicle's C_A, area and mass",
+    ),
     "vehicle": (
         "pre-flight-drag",
         "pre-flight drag",
-        "is beyond the pre-flight uncertainty: check mass, area and coefficients",
+        "is beyond the pre-flight uncertainty: check C_A, area and mass, and the density of the sounding",
     ),
 }
+_NAMED = 3  # failed checks in one sentence
 _MOST_OUTSIDE = 3.0  # sd beyond a physical range
 _ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
@@ -114,6 +119,24 @@ def consistency_check(
     return ConsistencyCheck(
         code, name, float(value), float(low), float(high), passed, remark, source, component, symptom
     )
+
+
+def doubt(failed: Sequence[str], checks: int) -> str:
+    """What failed checks mean for every answer, in one sentence; empty where none fails.
+
+    Parameters
+    ----------
+    failed : sequence of str
+        Names of the checks that fail.
+    checks : int
+        How many there are.
+    """
+    if not failed:
+        return ""
+    names = list(dict.fromkeys(name.partition(":")[0] for name in failed))
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    words = f"{len(failed)} of {checks} consistency checks fail{'s' * (len(failed) == 1)} "
+    return f"{words}({', '.join(names[:_NAMED])}{more}): do not use values and their ± before the cause is found"
 
 
 def nis_check(

@@ -49,11 +49,13 @@ from recon.time_bias import ClockJump, Lag
 _CONFIDENCE = 0.999  # of each test: of some twenty a flight, one false alarm in fifty flights
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
 _ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # codes of checks about one tracker or sensor
-_AIR_CODES = (
-    "sounding", "pre-flight-drag", "sounding-density", "sounding-temperature", "drag-jump", "sounding-wind",
-    "pre-flight-ca", "force-residuals",
-)  # fmt: skip
-_AIR_SOURCES = {code: "vehicle" if code.startswith("pre-flight") else "atmosphere" for code in _AIR_CODES}
+# of checks of the air; the drag shows density times C_A times area over mass: what is off may be in either file
+_AIR_SOURCES = {
+    **dict.fromkeys(("sounding", "sounding-density"), ("atmosphere", "vehicle")),
+    **dict.fromkeys(("pre-flight-drag", "pre-flight-ca"), ("vehicle", "atmosphere")),
+    **dict.fromkeys(("sounding-temperature", "drag-jump", "sounding-wind"), ("atmosphere",)),
+    "force-residuals": ("air",),
+}
 _SHARED_CODES = ("place", "sites")  # about what all trackers share
 _ABOUT_BOTH = ("clock-lag", "triads-axes")
 # of readings that the drag follows: no likelihood of theirs is for or against another fault
@@ -389,11 +391,12 @@ def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) 
     if any(v.code == "filter-smoother" for v in failed) and not out:
         what = "motion: filter and smoother differ by more than sensor noise and errors explain"
         out.append(FaultHypothesis(what, "motion"))
-    rest = [("attitude", v) for v in failed if v.code.startswith("attitude-")]
-    rest += [("air", replace(v, source=v.source or _AIR_SOURCES[v.code])) for v in failed if v.code in _AIR_CODES]
-    rest += [("error-model", v) for v in failed if v.code == "physical-range"]
-    rest += [("stated-noise", v) for v in failed if is_generous(v)]
-    sentences = {FaultHypothesis(f"{what}: {v.remark}", what, (v.source,)): None for what, v in rest}
+    rest = [("attitude", v, (v.source,)) for v in failed if v.code.startswith("attitude-")]
+    of_air = sorted((v for v in failed if v.code in _AIR_SOURCES), key=lambda v: -v.value / v.high)
+    rest += [("air", v, _AIR_SOURCES[v.code]) for v in of_air]  # the farthest beyond its limit first
+    rest += [("error-model", v, (v.source,)) for v in failed if v.code == "physical-range"]
+    rest += [("stated-noise", v, (v.source,)) for v in failed if is_generous(v)]
+    sentences = {FaultHypothesis(f"{what}: {v.remark}", what, names): None for what, v, names in rest}
     return (*out, *sentences)
 
 

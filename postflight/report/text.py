@@ -22,6 +22,7 @@ from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
 from postflight.run_folder import answer_table
 from postflight.sensitivity import largest_of_groups
+from recon.consistency import doubt
 
 _HOW = {
     "camera": "Edge and features, or texture, of the aeroshell in the onboard video.",
@@ -55,7 +56,16 @@ def pair(value: float, sd: float) -> str:
 
 
 def title(run: Run) -> str:
-    """Return the answer in one sentence."""
+    """Return the answer in one sentence, which begins with its doubt where checks fail."""
+    return f"In doubt: {_answer(run)}" if _doubt(run) else _answer(run)
+
+
+def _doubt(run: Run) -> str:
+    """What failed checks mean for the answers; empty where all pass."""
+    return doubt([str(name) for name in run.checks.loc[~run.checks["passed"].astype(bool), "name"]], len(run.checks))
+
+
+def _answer(run: Run) -> str:
     best = best_method(run)
     if best is not None:
         answer = run.summary["methods"][best]
@@ -98,7 +108,7 @@ def lead(run: Run) -> list[str]:
         out.append(f"{rests[0].upper()}{rests[1:]}.")
     if run.changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(run.changes)}.")
-    return out
+    return [f"{doubtful}.", *out] if (doubtful := _doubt(run)) else out
 
 
 def _rests_on(lines: list[str]) -> str:
@@ -169,7 +179,10 @@ def _card(run: Run, method: str) -> dict[str, Any]:
         "plane": plane_at(run, method), "largest": f"{answer['largest_deg']:.2f}", "largest_s": answer["largest_at_s"],
         "assumptions": answer["assumptions"],
     }  # fmt: skip
-    return card | _agreement(run, method)
+    card |= _agreement(run, method)
+    if method == "fused" and (doubtful := _doubt(run)):
+        card |= {"state": "differs", "mark": "✕", "remark": f"in doubt; {card['remark']}", "detail": doubtful}
+    return card
 
 
 def _agreement(run: Run, method: str) -> dict[str, str]:

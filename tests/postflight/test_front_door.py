@@ -16,7 +16,9 @@ import postflight as pf
 from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
 from postflight import commands
+from postflight.reconstruction import reconstruction_from
 from postflight.streams import on_one_thread
+from recon.consistency import doubt
 from tests.refusing import numbers_in
 
 UNITS = {"s", "m", "deg", "degps", "mps", "mps2", "pa", "k", "kgpm3", "px", "hz", "g", "nm", "j", "nms", "w", "kgm2"}
@@ -109,6 +111,27 @@ def test_the_door_imports_nothing_heavy():
     code = f"import sys, postflight; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_wrong_vehicle_puts_every_answer_in_doubt_at_once(flight, bet, answer, capsys):
+    """Another vehicle's mass: checks of the air are red, and the first words of repr and command say so."""
+    assert answer.doubt == ""
+    heavy = reconstruction_from(flight.with_(mass_kg=1.8 * flight.vehicle.mass_kg), bet.solution)
+    assert "pre-flight-ca" in {check.code for check in heavy.consistency_checks if not check.passed}
+    assert heavy.suspects[0].sources == ("vehicle", "atmosphere")
+    doubtful = replace(answer, bet=heavy)
+    assert repr(doubtful).removeprefix("<Deflections: ").startswith(doubtful.doubt)
+    assert repr(heavy).removeprefix("<Reconstruction: ").startswith(doubt_of(heavy))
+    commands.print_answers(doubtful)
+    commands.print_answers(answer)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert printed.startswith(f"in doubt {doubtful.doubt} [answers-in-doubt]")
+    assert printed.count("[answers-in-doubt]") == 1
+
+
+def doubt_of(found):
+    failed = [check.name for check in found.consistency_checks if not check.passed]
+    return doubt(failed, len(found.consistency_checks))
 
 
 # what-ifs

@@ -21,6 +21,7 @@ from postflight.report import text as texts
 from postflight.report.panels import trajectory_panels, trajectory_rows
 from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
+from recon.consistency import doubt
 from tests.postflight.report.conftest import HOSTILE
 
 LARGEST_BYTES = 3_000_000
@@ -271,6 +272,21 @@ def test_failed_checks_and_findings_are_shown(run) -> None:
     assert ": north: its &lt;i&gt; time bias" in text
     assert "gap of 3 s" in text
     assert texts.table_rows(found)["more"] == 300 - texts.SHOWN_ROWS
+
+
+def test_failed_checks_are_in_the_title_the_first_sentence_and_on_the_fused_card(run) -> None:
+    checks = run.tables["consistency_checks"]
+    red = checks.assign(passed=~checks["name"].isin(checks["name"].iloc[:2]))
+    one = type(run)(**{**vars(run), "tables": run.tables | {"consistency_checks": red}})
+    failed = red.loc[~red["passed"], "name"]
+    words = doubt(list(failed), len(red))
+    assert all(name.partition(":")[0] in words for name in failed)
+    assert texts.title(one) == f"In doubt: {texts.title(run)}"
+    assert texts.lead(one)[0] == f"{words}."
+    sound, doubtful = ({card["method"]: card for card in texts.cards(each)} for each in (run, one))
+    assert (sound["fused"]["state"], doubtful["fused"]["state"]) == ("agrees", "differs")
+    assert doubtful["camera"] == sound["camera"]
+    assert doubtful["fused"]["remark"] in page(one)
 
 
 def test_sensitivity_is_shown_by_groups() -> None:
