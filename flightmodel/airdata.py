@@ -25,6 +25,7 @@ from flightmodel.trajectory import Trajectory
 
 VELOCITIES = ("inertial", "ground", "wind")
 ANGLES = ("latitude", "longitude", "roll", "pitch", "yaw", "alpha", "beta")
+_SLOPE_STEP_M = 100.0  # either side: density's slope; far above rounding, a hundredth of the scale height
 _STEP_M = 1000.0  # over which air is linear enough: an eighth of its scale height
 
 
@@ -209,10 +210,7 @@ def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: Flo
         for name in VELOCITIES
     }
     sd = {name: _total_sd(flow.body_mps[name], cov[name]) for name in VELOCITIES}
-    speed_var = _speed_var(trajectory, flow.point_ecef_mps["wind"], speed) + wind_var
     v_ned = np.einsum("nij,nj->ni", flow.dcm_ned_ecef, flow.point_ecef_mps["ground"])
-    with np.errstate(divide="ignore", invalid="ignore"):  # at rest
-        pressure_sd = np.sqrt(air.density_sd**2 + 4.0 * speed_var / speed**2)
     return AirData(
         time_s=trajectory.time_s,
         altitude_m=flow.altitude_m,
@@ -223,7 +221,7 @@ def air_data(trajectory: Trajectory, profile: AtmosphereProfile, arm_body_m: Flo
         airspeed_mps=speed,
         mach=flow.mach,
         dynamic_pressure_pa=pressure,
-        dynamic_pressure_sd_pa=pressure * pressure_sd,
+        dynamic_pressure_sd_pa=pressure * np.sqrt(air.density_sd**2 + _pressure_var(trajectory, flow, profile)),
         alpha_rad=flow.alpha_rad,
         beta_rad=flow.beta_rad,
         alpha_total_wind_rad=total["wind"],
@@ -263,11 +261,23 @@ def _total_sd(v_body: FloatArray, cov: FloatArray) -> FloatArray:
     return np.sqrt(np.einsum("ni,nij,nj->n", direction, cov, direction))
 
 
-def _speed_var(trajectory: Trajectory, v_air: FloatArray, speed: FloatArray) -> FloatArray:
+def _pressure_var(trajectory: Trajectory, flow: _Flow, profile: AtmosphereProfile) -> FloatArray:
+    """Relative variance (n,) of dynamic pressure by height, velocity and the sounding's horizontal wind.
+
+    To first order what `derived_with_sd` has; NaN without a trajectory covariance, and at rest.
+    """
     if trajectory.covariance is None:
-        return np.full(len(speed), np.nan)
-    unit = v_air / _or_nan(speed)[:, None]
-    return np.einsum("ni,nij,nj->n", unit, trajectory.covariance[:, 3:6, 3:6], unit)
+        return np.full(len(flow.altitude_m), np.nan)
+    height, speed = flow.altitude_m, _or_nan(flow.airspeed_mps)
+    low, high = (np.log(profile.at(height + side * _SLOPE_STEP_M).density_kgpm3) for side in (-1.0, 1.0))
+    thinner = (high - low) / (2.0 * _SLOPE_STEP_M)
+    if profile.met_m is not None:  # air that was measured where the vehicle was rises with it
+        thinner[(height >= profile.met_m[0]) & (height <= profile.met_m[1])] = 0.0
+    up, along = -flow.dcm_ned_ecef[:, 2], flow.point_ecef_mps["wind"] / speed[:, None]
+    jacobian = np.concatenate([thinner[:, None] * up, 2.0 * along / speed[:, None]], axis=1)
+    by_path = np.einsum("ni,nij,nj->n", jacobian, trajectory.covariance[:, :6, :6], jacobian)
+    level = 1.0 - np.einsum("ni,ni->n", up, along) ** 2  # of the flow's direction, squared: it alone meets the wind
+    return np.asarray(by_path + 4.0 * level * (flow.air.wind_sd_mps / speed) ** 2)
 
 
 def _path_angles(velocity_ned: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -21,6 +21,7 @@ from postflight.montecarlo.bands import Merged, merge, write_merged
 from postflight.montecarlo.study import read_study
 from postflight.reconstruction import Reconstruction
 from postflight.report import write
+from postflight.run_folder import value_and_sd
 from postflight.scoring import Score, score_run
 from synthetic_flight.ensemble import available_cores
 from synthetic_flight.folder import simulate_to_folder
@@ -193,6 +194,12 @@ def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflec
 
 Row = tuple[str, str, float, float, float, float]
 DEG = 180.0 / np.pi
+# quantity at peak dynamic pressure, its unit and its column of bet.csv
+_AT_PEAK = (
+    ("peak dynamic pressure", "Pa", "dynamic_pressure_pa"),
+    ("Mach number at peak q", "", "mach"),
+    ("total angle of attack at peak q", "deg", "alpha_total_wind_deg"),
+)
 
 
 def _bet_of(answer: Deflections) -> Reconstruction:
@@ -206,25 +213,13 @@ def _passed(bet: Reconstruction) -> float:
 
 
 def _peak_rows(first: Reconstruction, second: Reconstruction) -> list[Row]:
-    values = []
-    for bet in (first, second):
-        air, at = bet.air, bet.peak_s
-
-        def there(column: object, time_s: object = air.time_s, at: float = at) -> float:
-            return float(np.interp(at, time_s, column))  # type: ignore[call-overload]
-
-        values.append(
-            {
-                ("time of peak dynamic pressure", "s"): (at, np.nan),
-                ("peak dynamic pressure", "Pa"): (there(air.dynamic_pressure_pa), there(air.dynamic_pressure_sd_pa)),
-                ("Mach number at peak q", ""): (there(air.mach), np.nan),
-                ("total angle of attack at peak q", "deg"): (
-                    np.rad2deg(there(air.alpha_total_wind_rad)),
-                    np.rad2deg(there(air.alpha_total_wind_sd_rad)),
-                ),
-            }
-        )
-    return [(*key, *values[0][key], *values[1][key]) for key in values[0]]
+    """Values at each one's own peak, as events.csv and peaks.csv have them."""
+    bets = (first, second)
+    rows: list[Row] = [("time of peak dynamic pressure", "s", first.peak_s, np.nan, second.peak_s, np.nan)]
+    for name, unit, column in _AT_PEAK:
+        one, other = (value_and_sd(bet.table, column, bet.peak_s) for bet in bets)
+        rows.append((name, unit, *one, *other))
+    return rows
 
 
 def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from flightmodel.airdata import air_data, lateral_angles
+from flightmodel.airdata import air_data, derived_with_sd, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.camera import one_to_one_half_angle_rad
 from flightmodel.deflection import lv_direction, polar_from_lateral
@@ -109,6 +109,19 @@ def test_errors_of_flow_and_pressure_are_those_of_moved_states(seed):
     size = np.abs(change).max()
     np.testing.assert_allclose(air.lateral_flow_cov[0], np.outer(change, change), atol=0.02 * size**2)
     assert air.dynamic_pressure_sd_pa[0] == pytest.approx(0.5 * abs(pressures[0] - pressures[1]), rel=1e-3)
+
+
+@pytest.mark.parametrize("met_m", [None, (0.0, 1e5)])
+def test_dynamic_pressure_has_one_sd(met_m):
+    """That of `air_data`, to first order, is that of the moved states of bet.csv: height and a level wind included."""
+    root = np.random.default_rng(5).normal(size=(9, 9)) * np.repeat([60.0, 0.5, 1e-3], 3)[:, None]
+    for velocity in ((900.0, 4.0, -7.0), (300.0, 250.0, -600.0)):
+        path = flight(np.zeros(3), root @ root.T, velocity)
+        n = len(standard_atmosphere().wind_sd_mps)
+        air = replace(standard_atmosphere(), wind_sd_mps=np.full(n, 20.0), density_sd=np.zeros(n), met_m=met_m)
+        _, sd = derived_with_sd(path, air, np.zeros(3))
+        found = air_data(path, air, np.zeros(3)).dynamic_pressure_sd_pa
+        np.testing.assert_allclose(found, sd["dynamic_pressure"], rtol=0.01)
 
 
 def test_a_pinhole_folds_where_its_polynomial_turns():

@@ -17,6 +17,7 @@ from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
 from postflight import commands
 from postflight.reconstruction import reconstruction_from
+from postflight.run_folder import peak_table
 from postflight.streams import on_one_thread
 from recon.consistency import doubt
 from tests.refusing import numbers_in
@@ -261,6 +262,11 @@ def test_two_looks_side_by_side(bet, answer, flight):
     same = pf.compare(answer, answer).to_frame()
     assert same["difference"].abs().max() < 1e-9  # an attitude against itself is zero to rounding
     assert {"deflection by misalignment at peak q", "deflection by fused at peak q"} <= set(same["quantity"])
+    (peak,) = (row for row in peak_table(bet, bet.table).itertuples() if row.peak == "dynamic pressure")
+    (mine,) = (row for row in same.itertuples() if row.quantity == "peak dynamic pressure")
+    assert (mine.first, mine.first_sd) == (peak.value, peak.sd)
+    at_peak = np.interp(bet.peak_s, bet.air.time_s, bet.air.dynamic_pressure_sd_pa)
+    assert at_peak == pytest.approx(peak.sd, rel=2e-3)
     other = pf.compare(bet, pf.reconstruct(flight.with_(density=1.1))).to_frame().set_index("quantity")
     row = other.loc["peak dynamic pressure"]
     assert row["second"] / row["first"] == pytest.approx(1.1, rel=1e-3)
