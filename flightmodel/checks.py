@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Sequence
+from numbers import Integral
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +93,18 @@ def check_type(name: str, value: object, kinds: type | tuple[type, ...], made_by
         wanted = " or ".join(kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
         given = type(value).__name__
         raise GateError(f"{name}: {wanted} wanted ({made_by}), {given} given", code="argument-type")
+
+
+def check_path(name: str, value: str | Path) -> Path:
+    """Return the path, or raise `GateError` where an argument of the public interface is none."""
+    check_type(name, value, (str, Path), "the path of a folder")
+    return Path(value)
+
+
+def check_whole(name: str, value: int | None, low: int) -> None:
+    """Raise `ConfigError` where an argument of the public interface is no whole number from ``low``; None is none."""
+    if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < low):
+        raise ConfigError(f"{name} = {value!r}: a whole number from {low} is wanted", code="option-value")
 
 
 def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:

@@ -345,7 +345,7 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 )
 @click.option(
     "--joint",
-    type=FiniteRange(0.0, 1.0),
+    type=FiniteRange(0.0),
     help="Assume the joint this far aft of the nose, m; default: the vehicle file's.",
 )
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")

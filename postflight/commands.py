@@ -315,10 +315,12 @@ def asked(
             faults += fault.faults
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
-        if equals and name:
-            changes[name] = _toml_value(value)
-        else:
+        if not (equals and name):
             faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+        elif name in changes:
+            faults.append(Fault(f"--set {text}: {name} is set twice; give it once", "set-twice"))
+        else:
+            changes[name] = _toml_value(value)
     if faults:
         raise ConfigError(faults)
     return Asked(changes, without, rate_hz, run_name or "")

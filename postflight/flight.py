@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import ConfigError, Fault, GateError, Progress, nearest_name
+from flightmodel.checks import ConfigError, Fault, GateError, Progress, check_path, nearest_name
 from flightmodel.files import file_bytes
 from flightmodel.flightfolder import read_flight as read_telemetry
 from flightmodel.tabular import Tabular
@@ -91,9 +91,9 @@ class Flight(Tabular):
         mass_kg : float
             Total mass; both bodies in proportion, their c.g. and inertia tensors as they are.
         cg_shift_body_m : (3,) float
-            Shift of the vehicle's c.g., body axes; the centerbody carries it.
+            Shift of the vehicle's c.g., body axes; the centerbody carries it. The c.g. stays inside the vehicle.
         joint_station_m : float
-            Joint aft of the nose.
+            Joint aft of the nose, inside the vehicle.
         density : float
             Factor on the sounding's density and pressure, temperature as it is.
         wind : float or None
@@ -173,8 +173,9 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
     report: Callable[[float], None] | None = None
     if progress is not None:
         report = lambda fraction: progress(fraction, "reading telemetry")  # noqa: E731
-    telemetry = read_telemetry(Path(folder), report, needs_path)
-    return Flight(telemetry, folder=Path(folder), as_read=_as_read(Path(folder), telemetry))
+    folder = check_path("read_flight: folder", folder)
+    telemetry = read_telemetry(folder, report, needs_path)
+    return Flight(telemetry, folder=folder, as_read=_as_read(folder, telemetry))
 
 
 def _as_read(folder: Path, telemetry: Telemetry) -> dict[str, bytes]:
@@ -254,6 +255,12 @@ def _vehicle_of(telemetry: Telemetry, name: str) -> Vehicle:
     return telemetry.vehicle
 
 
+def _reach_m(vehicle: Vehicle) -> float:
+    """How far the vehicle reaches aft of its nose, m: the centerbody, or a shell drawn as a sharp cone."""
+    shell = vehicle.geometry
+    return max(shell.centerbody_length_m, float(shell.base_radius_m / np.tan(np.deg2rad(shell.half_angle_deg))))
+
+
 def _coefficient(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     vehicle = _vehicle_of(telemetry, name)
     aero = vehicle.aero.scaled(**{name.replace("_", ""): _number(name, value, 0.0, 10.0)})
@@ -265,9 +272,18 @@ def _mass(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
 
 
 def _cg_shift(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
-    vehicle, shift = _vehicle_of(telemetry, name), np.asarray(value, dtype=float)
+    vehicle, wanted = _vehicle_of(telemetry, name), f"assumption {name} = {value!r}"
+    try:
+        shift = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        shift = np.zeros(0)
     if shift.shape != (3,) or not np.isfinite(shift).all():
-        raise GateError(f"assumption {name} = {value!r}: three numbers in body axes, m, are wanted", "what-if-value")
+        raise GateError(f"{wanted}: three numbers in body axes, m, are wanted", "what-if-value")
+    x, y, z = vehicle.cg_m + shift
+    length, radius = _reach_m(vehicle), vehicle.geometry.base_radius_m
+    if not (-length <= x <= 0.0 and np.hypot(y, z) <= radius):
+        words = f"the c.g. would lie {-x:.3g} m aft of the nose and {np.hypot(y, z):.3g} m off the axis, outside the "
+        raise GateError(f"{wanted}: {words}vehicle: {length:.3g} m and {radius:.3g} m at most", "what-if-outside")
     carried = vehicle.mass_kg / vehicle.centerbody.mass_kg * shift
 
     def moved(name: str, part: MassProperties) -> MassProperties:
@@ -279,7 +295,11 @@ def _cg_shift(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
 
 def _joint_station(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     vehicle = _vehicle_of(telemetry, name)
-    joint = vehicle.joint.model_copy(update={"station_m": _number(name, value, -1e-9, 100.0)})
+    station, length = _number(name, value), _reach_m(vehicle)
+    if not 0.0 <= station <= length:
+        words = f"outside the vehicle, which reaches from the nose to {length:.3g} m aft of it"
+        raise GateError(f"assumption {name} = {value!r}: {words}", "what-if-outside")
+    joint = vehicle.joint.model_copy(update={"station_m": station})
     return replace(telemetry, vehicle=replace(vehicle, joint=joint))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import ConfigError, GateError, Progress, check_type
+from flightmodel.checks import GateError, Progress, check_path, check_type, check_whole
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.checks.folder_check import Report, check_folder
@@ -22,6 +22,7 @@ from postflight.montecarlo.study import read_study
 from postflight.reconstruction import Reconstruction
 from postflight.report import write
 from postflight.run_folder import value_and_sd
+from postflight.runs import find_run
 from postflight.scoring import Score, score_run
 from synthetic_flight.ensemble import available_cores
 from synthetic_flight.folder import simulate_to_folder
@@ -34,7 +35,7 @@ def check_flight(folder: str | Path) -> Report:
 
     Never refuses: what `read_flight` would refuse is listed in the report.
     """
-    return check_folder(Path(folder))
+    return check_folder(check_path("check_flight: folder", folder))
 
 
 def simulate(
@@ -70,21 +71,38 @@ def simulate(
     GateError
         The folder exists, or the flight diverged before the telemetry begins.
     """
+    check_whole("seed", seed, 0)
     chosen = scenario if isinstance(scenario, Scenario) else read_scenario(scenario)
     if folder is None:
         return fly_scenario(chosen, seed)
-    return simulate_to_folder(chosen, seed, Path(folder), progress, replace)
+    return simulate_to_folder(chosen, seed, check_path("simulate: folder", folder), progress, replace)
 
 
 def score(folder: str | Path, run: str | Path | None = None) -> Score:
-    """Compare a finished run of a synthetic flight (the newest, or the one given) with its truth.
+    """Compare a complete run of a synthetic flight with its truth.
+
+    Parameters
+    ----------
+    folder : path
+        The flight's.
+    run : str or path, optional
+        The run's name, its eight digits or its folder; ``plain`` for the last that is no what-if; the last by default.
 
     Raises
     ------
     GateError
-        Where there is no truth or no finished run.
+        Where there is no truth, or no such complete run.
     """
-    return score_run(Path(folder), None if run is None else Path(run))
+    folder = check_path("score: folder", folder)
+    return score_run(folder, _run(folder, run))
+
+
+def _run(folder: Path, run: str | Path | None) -> Path | None:
+    """Folder of the run that is meant; None for the last."""
+    if run is None:
+        return None
+    check_type("run", run, (str, Path), "a run's name, its eight digits or its folder")
+    return find_run(folder, run)
 
 
 def monte_carlo(
@@ -120,10 +138,9 @@ def monte_carlo(
     GateError
         The folder holds another study.
     """
-    for name, value in (("flights", flights), ("workers", workers)):
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-            raise ConfigError(f"{name} = {value!r}: a whole number from 1 is wanted", code="option-value")
-    study, folder = read_study(str(dispersions)), Path(folder)
+    check_whole("flights", flights, 1)
+    check_whole("workers", workers, 1)
+    study, folder = read_study(str(dispersions)), check_path("monte_carlo: folder", folder)
     wanted = execution.Wanted(flights or study.spec.flights, workers or available_cores(), None, study.spec.stop)
     count = execution.run(study, folder, wanted, progress or (lambda _fraction, _what: None))
     merged = merge(study, folder, count)
@@ -132,14 +149,22 @@ def monte_carlo(
 
 
 def write_report(folder: str | Path, run: str | Path | None = None) -> Path:
-    """Write the report of a finished run (the newest, or the one given) as one HTML file; return where it lies.
+    """Write the report of a complete run as one HTML file; return where it lies.
+
+    Parameters
+    ----------
+    folder : path
+        The flight's.
+    run : str or path, optional
+        As `score` takes it.
 
     Raises
     ------
     GateError
         Where the run cannot be read, or the file not be written.
     """
-    return write.write_report(Path(folder), None if run is None else Path(run))
+    folder = check_path("write_report: folder", folder)
+    return write.write_report(folder, _run(folder, run))
 
 
 @dataclass(frozen=True, repr=False)

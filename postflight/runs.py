@@ -58,14 +58,19 @@ def complete_runs(flight_folder: Path) -> list[Path]:
 
 def facts_of(run: Path) -> dict[str, Any]:
     """Return ``run.json``; `GateError` where it cannot be read."""
+    return read_back(run / FACTS, "settings")
+
+
+def read_back(path: Path, *parts: str) -> dict[str, Any]:
+    """Return a JSON object of a run in which these parts are objects too; `GateError` where it cannot be read."""
     try:
-        facts = json.loads(file_bytes(run / FACTS))
-        if isinstance(facts, dict) and isinstance(facts.get("settings"), dict):
-            return facts
-        fault: object = "it states no settings"
-    except (OSError, ValueError) as found:
-        fault = found
-    raise GateError(f"{run / FACTS}: cannot be read back ({fault}); run it again", "run-incomplete")
+        found = json.loads(file_bytes(path))
+        if isinstance(found, dict) and all(isinstance(found.get(part), dict) for part in parts):
+            return found
+        fault: object = f"it states no {' and no '.join(parts)}"
+    except (OSError, ValueError) as refused:
+        fault = refused
+    raise GateError(f"{path}: cannot be read back ({fault}); run it again", "run-incomplete")
 
 
 def changes_of(facts: dict[str, Any]) -> tuple[str, ...]:
@@ -73,26 +78,32 @@ def changes_of(facts: dict[str, Any]) -> tuple[str, ...]:
     return tuple(map(str, facts["settings"].get("changes") or ()))
 
 
-def find_run(flight_folder: Path, wanted: str | None = None) -> Path:
+def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
     """Return the last complete run, or the last that is meant by a word.
 
     Parameters
     ----------
     flight_folder : Path
-    wanted : str or None
-        The run's name, its eight digits or its folder's name; ``plain`` for the last without a changed assumption.
+    wanted : str, Path or None
+        The run's name, its eight digits, its folder or the folder's name; ``plain`` for the last without a changed
+        assumption.
 
     Raises
     ------
     GateError
-        ``run-missing`` where the flight has no complete run, ``run-unknown`` where none is so called.
+        ``run-missing`` where the flight has no complete run, ``run-unknown`` where none is so called,
+        ``run-incomplete``, ``run-of-another`` where the folder is not one, or of another flight.
     """
     runs = complete_runs(flight_folder)
+    named = {name for run in runs for name in _names(run)}
+    if wanted is not None and str(wanted) not in (PLAIN, *named) and Path(wanted).is_dir():
+        return _whole(flight_folder, Path(wanted))
     if not runs:
         words = f"{flight_folder}: no complete run; use `postflight run {flight_folder}` first"
         raise GateError(words, "run-missing")
     if wanted is None:
         return runs[-1]
+    wanted = str(wanted)
     if wanted == PLAIN:
         fitting = [run for run in runs if not changes_of(facts_of(run))]
     else:
@@ -103,6 +114,18 @@ def find_run(flight_folder: Path, wanted: str | None = None) -> Path:
     listed = "; ".join(f"{run.name} ({_about(facts_of(run))})" for run in runs[-_SHOWN:])
     words = f"{flight_folder}: no complete run '{wanted}'{nearest_name(wanted, known)}; there are: {listed}"
     raise GateError(words, "run-unknown")
+
+
+def _whole(flight_folder: Path, run: Path) -> Path:
+    """Return the folder of a run of this flight, or raise `GateError` with what it lacks."""
+    if run.resolve().parent != (flight_folder / "runs").resolve():
+        words = f"{run}: no run of {flight_folder}, whose runs lie in {flight_folder / 'runs'}"
+        raise GateError(words, "run-of-another")
+    missing = [name for name in _COMPLETE if not (run / name).is_file()]
+    if missing:
+        words = f"{run}: no complete run, without {', '.join(missing)}; `postflight run` leaves one, `reconcile` and "
+        raise GateError(f"{words}`deflection` do not", "run-incomplete")
+    return run
 
 
 def _names(run: Path) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ vehicle, flight and instrument. How small the standard deviations are is printed
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,10 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
-from flightmodel.files import file_bytes
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import difference, resample
 from postflight.run_folder import answer_table, read_csv
-from postflight.runs import STATE_COLUMNS, deflection_history, find_run, trajectory_of
+from postflight.runs import STATE_COLUMNS, deflection_history, find_run, read_back, trajectory_of
 
 LIMIT_SD = 4.0  # a normal error passes it once in 16 000
 METHODS = ("camera", "misalignment", "trim", "fused")
@@ -86,7 +84,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     deflection = _read(truth_folder / "deflection.csv", ("t_s", "theta_deg"))
     peak_s, _ = find_peak(truth["t_s"].to_numpy(), truth["dynamic_pressure_pa"].to_numpy())
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
-    refused = json.loads(file_bytes(run / "summary.json"))["methods"]
+    refused = read_back(run / "summary.json", "methods")["methods"]
     methods: dict[str, dict[str, Any]] = {}
     failures: list[Fault] = []
     written = {path.stem for path in run.glob("*.csv")}
@@ -106,7 +104,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
         for name in BET_SD
         if not bet[name] <= LIMIT_SD * bet[_sd(name)]
     ]
-    vehicle = json.loads(file_bytes(run / "bet_header.json"))["vehicle"]
+    vehicle = read_back(run / "bet_header.json").get("vehicle")
     return Score(peak_s, methods, bet, tuple(failures), "" if vehicle is None else vehicle["name"])
 
 

@@ -391,7 +391,8 @@ def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) 
     if any(v.code == "filter-smoother" for v in failed) and not out:
         what = "motion: filter and smoother differ by more than sensor noise and errors explain"
         out.append(FaultHypothesis(what, "motion"))
-    rest = [("attitude", v, (v.source,)) for v in failed if v.code.startswith("attitude-")]
+    rest: list[tuple[str, ConsistencyCheck, tuple[str, ...]]] = []
+    rest += [("attitude", v, (v.source,)) for v in failed if v.code.startswith("attitude-")]
     of_air = sorted((v for v in failed if v.code in _AIR_SOURCES), key=lambda v: -v.value / v.high)
     rest += [("air", v, _AIR_SOURCES[v.code]) for v in of_air]  # the farthest beyond its limit first
     rest += [("error-model", v, (v.source,)) for v in failed if v.code == "physical-range"]

@@ -129,7 +129,8 @@ def check_destination(destination: Path, replace: bool) -> None:
     ours = (destination / "truth" / "run.json").is_file() and (destination / "flight.toml").is_file()
     if not replace:
         raise GateError(
-            f"{destination}: exists already; choose another folder, or give --force to replace it", code="folder-exists"
+            f"{destination}: exists already; choose another folder, or replace it (--force, in Python replace=True)",
+            code="folder-exists",
         )
     if not ours:
         raise GateError(

@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import postflight as pf
 from flightmodel.checks import ConfigError
 from flightmodel.tabular import Tabular
-from postflight import commands
+from postflight import commands, interface
 from postflight.reconstruction import reconstruction_from
 from postflight.run_folder import peak_table
 from postflight.streams import on_one_thread
@@ -93,6 +93,31 @@ def test_a_folder_where_a_flight_or_its_trajectory_is_wanted_is_refused(call, wr
     with pytest.raises(pf.GateError) as fault:
         call(wrong)
     assert fault.value.codes == ("argument-type",)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        pf.read_flight,
+        pf.check_flight,
+        pf.score,
+        pf.write_report,
+        lambda wrong: pf.score("flight", wrong),
+        lambda wrong: pf.simulate("irve2_reference", wrong),
+        lambda wrong: pf.monte_carlo("irve2_reference", wrong),
+    ],
+)
+def test_a_number_where_a_folder_is_wanted_is_refused(call):
+    with pytest.raises(pf.GateError) as fault:
+        call(3)
+    assert fault.value.codes == ("argument-type",)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", True])
+def test_a_seed_that_is_none_is_refused(seed):
+    with pytest.raises(ConfigError) as fault:
+        pf.simulate("irve2_reference", seed=seed)
+    assert fault.value.codes == ("option-value",)
 
 
 @pytest.mark.parametrize("call", [pf.read_vehicle, pf.read_scenario, pf.simulate])
@@ -231,6 +256,10 @@ def test_a_command_leaves_out_more_and_writes_at_another_rate_without_a_what_if(
     with pytest.raises(ConfigError) as refusal:
         commands.asked(("c_n", "=1"), (), None)
     assert refusal.value.codes == ("set-form", "set-form")
+    with pytest.raises(ConfigError) as refusal:  # with_(c_n=1.2, c_n=1.0) is no Python either
+        commands.asked(("c_n=1.2", "wind=none", "c_n=1.0"), (), None)
+    assert refusal.value.codes == ("set-twice",)
+    assert "c_n" in str(refusal.value)
 
 
 def test_settings_and_answers_are_of_their_types(bet, flight):
@@ -256,6 +285,55 @@ def test_a_change_that_replaces_another_is_named_alone(flight):
     assert twice.changes == ("c_n = 1.2", "output_rate_hz = 2.0", "c_n = 1.5")
     assert twice.settings.output_rate_hz == 2.0
     assert twice.vehicle.aero.at(5.0, 0.1)[1] == pytest.approx(1.8 * flight.vehicle.aero.at(5.0, 0.1)[1])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"joint_station_m": 50.0},
+        {"joint_station_m": -0.1},
+        {"cg_shift_body_m": (-9.0, 0.0, 0.0)},
+        {"cg_shift_body_m": (0.9, 0.0, 0.0)},
+        {"cg_shift_body_m": (0.0, 1.0, 1.2)},
+    ],
+)
+def test_what_lies_outside_the_vehicle_is_refused(flight, changes):
+    with pytest.raises(ConfigError) as refusal:
+        flight.with_(**changes)
+    assert refusal.value.codes == ("what-if-outside",)
+
+
+def test_a_word_for_a_shift_is_refused(flight):
+    with pytest.raises(ConfigError) as refusal:
+        flight.with_(cg_shift_body_m="aft")
+    assert refusal.value.codes == ("what-if-value",)
+
+
+def test_a_run_is_chosen_by_name_digits_or_folder(tmp_path, monkeypatch):
+    """Every way to name a run reaches score and report; what is no whole run of this flight is refused."""
+    runs = tmp_path / "flight" / "runs"
+    (tmp_path / "flight" / "truth").mkdir(parents=True)
+    (tmp_path / "flight" / "truth" / "truth.csv").touch()
+    there = [runs / "20260101T000000Z-11111111", runs / "20260102T000000Z-22222222-calm"]
+    for run in there:
+        run.mkdir(parents=True)
+        for name in ("bet.csv", "run.json", "summary.json", "bet_header.json"):
+            (run / name).write_text('{"settings": {}}')
+    joint = runs / "20260103T000000Z-33333333"  # of a reconciliation
+    joint.mkdir()
+    (joint / "run.json").write_text('{"settings": {}}')
+    asked = []
+    monkeypatch.setattr(interface, "score_run", lambda folder, run: asked.append(run))
+    monkeypatch.setattr(interface.write, "write_report", lambda folder, run: asked.append(run))
+    for call in (pf.score, pf.write_report):
+        for run in ("calm", "22222222", str(there[1]), there[1], "11111111", there[0], None):
+            call(tmp_path / "flight", run)
+        assert asked == [*[there[1]] * 4, *[there[0]] * 2, None]
+        asked.clear()
+        for run, code in ((joint, "run-incomplete"), (tmp_path, "run-of-another"), ("cold", "run-unknown")):
+            with pytest.raises(pf.GateError) as fault:
+                call(tmp_path / "flight", run)
+            assert fault.value.codes == (code,)
 
 
 def test_two_looks_side_by_side(bet, answer, flight):

@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from flightmodel import earth
+from flightmodel.checks import GateError
 from postflight.commands import console, print_score
 from postflight.scoring import score_run
 
@@ -63,6 +64,16 @@ def test_so_is_the_trajectory(flight, sd):
     assert not right.failures
     assert right.bet["position_sd_m"] == pytest.approx(np.sqrt(3.0) * sd)
     assert [f.code for f in wrong.failures] == ["trajectory-error"]
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"methods": 3}'])
+def test_a_summary_that_is_damaged_is_refused(flight, tmp_path, content):
+    flight()
+    (run,) = (tmp_path / "runs").iterdir()
+    (run / "summary.json").write_text(content)
+    with pytest.raises(GateError) as refusal:
+        score_run(tmp_path, run)
+    assert refusal.value.codes == ("run-incomplete",)
 
 
 def test_published_figures_stand_beside_their_own_vehicle_alone(flight):
