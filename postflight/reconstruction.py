@@ -39,6 +39,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.telemetry import LARGEST_GAP_S, Finding, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
+from postflight.checks.track_clocks import clock_faults
 from postflight.flight import READ, Flight
 from postflight.streams import on_one_thread
 from recon.atmosphere import (
@@ -58,7 +59,7 @@ from recon.entry_density import (
     profile_as_flown,
     temperature_check,
 )
-from recon.fault_isolation import isolate_faults
+from recon.fault_isolation import FaultHypothesis, isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
@@ -157,6 +158,8 @@ class Reconstruction(Tabular):
         Air by the deceleration with the drag of [drag], `recon.entry_density`.
     density_checks : tuple of ConsistencyCheck
         Of that density against the stated atmosphere's.
+    clocks : tuple of FaultHypothesis
+        Time tags that are off by tracks against inertial sensors; looked for where a check fails.
     """
 
     flight: Flight
@@ -169,6 +172,7 @@ class Reconstruction(Tabular):
     attitude: AttitudeCheck | None = None
     density: pd.DataFrame | None = None
     density_checks: tuple[ConsistencyCheck, ...] = ()
+    clocks: tuple[FaultHypothesis, ...] = ()
 
     @property
     def telemetry(self) -> Telemetry:
@@ -195,7 +199,8 @@ class Reconstruction(Tabular):
     @property
     def suspects(self) -> tuple[Fault, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
-        return isolate_faults(self.consistency_checks, self.solution.left_out, self.solution.single_faults)
+        checks, solution = self.consistency_checks, self.solution
+        return (*self.clocks, *isolate_faults(checks, solution.left_out, solution.single_faults))
 
     @property
     def rests_on(self) -> tuple[str, ...]:
@@ -305,14 +310,25 @@ def reconstruct(flight: Flight, settings: Settings | None = None, progress: Prog
         solution = solve(flight.telemetry, flight.settings, lambda f, what: report(0.95 * f, what))
     except GateError as fault:
         if "not-finite" in fault.codes:  # of a path: telemetry that is not finite does not pass its reader
-            raise DivergenceError(f"reconstruction: diverged beyond all numbers. {_DIVERGED}", _CODE) from None
-        raise
+            fault = DivergenceError(f"reconstruction: diverged beyond all numbers. {_DIVERGED}", _CODE)
+        raise _with_clocks(flight, fault) from None
     report(0.95, "checking the attitude")
     attitude = check_attitude(flight.telemetry, solution)
     report(0.97, "finding the as-flown atmosphere")
-    found = replace(reconstruction_from(flight, solution), attitude=attitude)
+    try:
+        found = replace(reconstruction_from(flight, solution), attitude=attitude)
+    except DivergenceError as fault:
+        raise _with_clocks(flight, fault) from None
+    if not all(check.passed for check in found.consistency_checks):
+        found = replace(found, clocks=clock_faults(flight.telemetry, flight.settings.without))
     report(1.0, "reconstructed")
     return found
+
+
+def _with_clocks(flight: Flight, fault: GateError) -> GateError:
+    """Return a fault; of a trajectory that diverges with the time tags that are off."""
+    found = clock_faults(flight.telemetry, flight.settings.without) if isinstance(fault, DivergenceError) else ()
+    return DivergenceError("; ".join((str(fault), *found)), fault.codes[0]) if found else fault
 
 
 def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconstruction:

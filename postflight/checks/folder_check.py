@@ -29,14 +29,13 @@ from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
+from postflight.checks.track_clocks import bias_of, is_sharp
 from postflight.checks.track_force import best_comparison, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
 from postflight.streams import write_out
 from postflight.terminal import few_of_each, terminal
 
-_SHARP_S = 0.5  # a time bias of a larger standard deviation is not reported
-_FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe the comparison
 _FORCE_WIDTH_S = 8.0  # the second derivative of a radar track of 5 m at 10 Hz is then good to 0.25 m/s2
 WIDE = 160  # of a log file: a table need not be squeezed there
 _LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
@@ -237,12 +236,13 @@ def _cross_check(found: Sources, report: Report) -> None:
     names = list(trackers)
     for k, first in enumerate(names):
         for second in names[k + 1 :]:
-            apart, bias = tracks.tracker_pair(found, first, second)
+            apart, bias = tracks.tracker_pair(trackers, first, second, found.spec.body)
             remarks += apart
             _keep_sharp(report, bias)
     for name, record in trackers.items():
         _against_accelerometer(found, name, record, report)
-    swings = inertial.oscillation_of(found)
+    strapdown = found.spec.motion.model == "strapdown"
+    swings = inertial.oscillation_of(found.triads if strapdown else {}, found.vehicle)
     remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
     _keep_sharp(report, swings.bias)
     rotation, lag = pressure_and_field.field_rotation(found)
@@ -268,10 +268,11 @@ def _against_accelerometer(found: Sources, name: str, record: RadarRecord | Gnss
     seen = best_comparison(
         record.time_s, tracks.position_of(record, planet), sensed.time_s, sensed.measured_sensor, planet
     )
-    if seen is not None and seen.misfit < _FITS:
+    bias = bias_of(name, seen)
+    if seen is not None and bias is not None:
         if not any(f.source == "accelerometer" for f in remarks):
             remarks += inertial.against_track(found, name, seen)
-        _keep_sharp(report, TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s))
+        _keep_sharp(report, bias)
 
 
 def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report: Report) -> None:
@@ -290,7 +291,7 @@ def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report:
 
 def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
     """Add a time bias to the report where its standard deviation is small enough; None where it is not."""
-    if bias is None or not bias.sd_s < _SHARP_S:
+    if bias is None or not is_sharp(bias):
         return None
     report.time_biases.append(bias)
     return bias

@@ -18,6 +18,7 @@ Accelerometer and gyros sense one oscillation, at one time and in one set of axe
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from flightmodel import earth, rotations, tables
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import LARGEST_GAP_S, AttitudePrior, Finding, TriadRecord
+from flightmodel.vehicle import Vehicle
 from postflight.checks.track_force import Comparison, TrackForce
 from postflight.checks.units_and_axes import (
     AS_DECLARED,
@@ -371,20 +373,20 @@ class Swings(NamedTuple):
     bias: TimeBias | None
 
 
-def oscillation_of(found: Sources) -> Swings:
+def oscillation_of(triads: Mapping[str, TriadRecord], vehicle: Vehicle | None) -> Swings:
     """Compare accelerometer and gyros by the oscillation of the vehicle; ``triads-axes`` or none."""
     # the filter's package, loaded where there are tables alone
     from recon.imu_screening import bridge
     from recon.oscillation import DELIVERED, LAG, LAG_STEP_S, axes_check, oscillation
 
-    force, rate = found.triads.get("accelerometer"), found.triads.get("rates")
-    if force is None or rate is None or found.spec.motion.model != "strapdown":
+    force, rate = triads.get("accelerometer"), triads.get("rates")
+    if force is None or rate is None:
         return Swings([], None)
     try:
         sensors = bridge(force, 0), bridge(rate, 1)
     except GateError:
         return Swings([], None)
-    swings = oscillation(*sensors, -np.inf, np.inf, found.vehicle)
+    swings = oscillation(*sensors, -np.inf, np.inf, vehicle)
     if swings is None:
         return Swings([], None)
     if swings.kind in (DELIVERED, LAG):

@@ -10,6 +10,7 @@ those that count seconds from it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 from typing import Any
 
@@ -21,7 +22,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.flightfolder import Sources
 from flightmodel.instruments import RADAR
 from flightmodel.tables import read_unit
-from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
+from flightmodel.telemetry import Finding, GnssRecord, RadarRecord, Telemetry
 from postflight.checks.track_force import TrackForce, coasting, track_force
 from postflight.checks.units_and_axes import (
     TimeBias,
@@ -45,7 +46,7 @@ _CARRIED_S = 0.1  # the gyros' samples reach this far beyond their ends
 _MOST_HOURS = 24  # of local time taken for UTC
 
 
-def tracks(found: Sources) -> dict[str, RadarRecord | GnssRecord]:
+def tracks(found: Sources | Telemetry) -> dict[str, RadarRecord | GnssRecord]:
     """Return radars and receivers that fix positions by themselves, by name."""
     whole = {name: r for name, r in found.radars.items() if np.isfinite(r.range_az_el).all(axis=1).any()}
     return {**whole, **{name: record for name, record in found.gnss.items() if record.has_positions}}
@@ -224,14 +225,18 @@ def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
 # two trackers
 
 
-def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding], TimeBias | None]:
+def tracker_pair(
+    trackers: Mapping[str, RadarRecord | GnssRecord], first: str, second: str, planet: earth.Planet
+) -> tuple[list[Finding], TimeBias | None]:
     """Compare two trackers where both are.
 
     Parameters
     ----------
-    found : Sources
+    trackers : mapping
+        Of `tracks`.
     first, second : str
-        Names of radars or receivers.
+        Names of two of them.
+    planet : Planet
 
     Returns
     -------
@@ -240,8 +245,7 @@ def tracker_pair(found: Sources, first: str, second: str) -> tuple[list[Finding]
     bias : TimeBias or None
         Of the second's time tags against the first's, where the distance lies along the motion.
     """
-    a, b = tracks(found)[first], tracks(found)[second]
-    planet = found.spec.body
+    a, b = trackers[first], trackers[second]
     pa, pb = position_of(a, planet), position_of(b, planet)
     a_whole, b_whole = np.isfinite(pa).all(axis=1), np.isfinite(pb).all(axis=1)
     ta, pa, tb, pb = a.time_s[a_whole], pa[a_whole], b.time_s[b_whole], pb[b_whole]

@@ -114,7 +114,7 @@ def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Findin
         which, name = "later" if late_s > 0 else "earlier", ", ".join(clock)
         words = (
             f"time tags are {abs(late_s):.3f} +/- {sd_s:.3f} s {which} than those of {' and '.join(others)}; "
-            f"if {name} is the one in error, add {-late_s:.3f} to its time.offset_s"
+            f"if {name} is the one in error, add {-late_s:+.3f} to its time.offset_s, else {late_s:+.3f} to theirs"
         )
         out.append(Finding(name, words, np.nan, np.nan, "clock-lag"))
         signs = _signs(clock, left)

@@ -13,9 +13,10 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import postflight as pf
-from flightmodel.checks import ConfigError
+from flightmodel.checks import ConfigError, DivergenceError
 from flightmodel.tabular import Tabular
-from postflight import commands, interface
+from postflight import commands, interface, reconstruction
+from postflight.checks.track_clocks import clock_faults
 from postflight.reconstruction import reconstruction_from
 from postflight.run_folder import peak_table
 from postflight.streams import on_one_thread
@@ -153,6 +154,33 @@ def test_a_wrong_vehicle_puts_every_answer_in_doubt_at_once(flight, bet, answer,
     printed = " ".join(capsys.readouterr().out.split())
     assert printed.startswith(f"in doubt {doubtful.doubt} [answers-in-doubt]")
     assert printed.count("[answers-in-doubt]") == 1
+
+
+def test_trackers_whose_time_tags_are_late_are_named_first(flight, monkeypatch):
+    """1.5 s, both: a red run names the clocks before what they bend, and one that is not followed names them too."""
+
+    def late(names):
+        radars = {k: replace(r, time_s=r.time_s + 1.5 * (k in names)) for k, r in flight.telemetry.radars.items()}
+        return replace(flight, telemetry=replace(flight.telemetry, radars=radars))
+
+    first, second = flight.telemetry.radars
+    both = late((first, second))
+    named = pf.reconstruct(both).suspects[0]
+    assert (named.code, set(named.sources)) == ("clock-lag", {first, second, "accelerometer", "rates"})
+    late_s, sd_s = [x for x in numbers_in(named) if x][:2]
+    assert abs(late_s - 1.5) < 4.0 * sd_s, named
+    assert late_s > 5.0 * sd_s
+    assert [set(one.sources) for one in clock_faults(late((first,)).telemetry)] == [{first}]
+    assert clock_faults(flight.telemetry) == ()
+
+    def lost(*_):
+        raise DivergenceError("track lost", "track-not-followed")
+
+    monkeypatch.setattr(reconstruction, "solve", lost)
+    with pytest.raises(DivergenceError) as fault:
+        pf.reconstruct(both)
+    assert fault.value.codes == ("track-not-followed",)
+    assert named in str(fault.value)
 
 
 def doubt_of(found):
