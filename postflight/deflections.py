@@ -144,9 +144,10 @@ class Deflections(Tabular):
             k = history.largest(self.pulse_s)
             plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
+            reason = "" if np.isfinite(theta) else str(no_answer_at(any_time, at_s))
             mean = np.rad2deg(mean_over(any_time, cycle)) if cycle is not None else (np.nan, np.nan)
             rows.append(
-                (method, at_s, theta, sd, plane, *largest, "", *np.rad2deg(quantiles_at(any_time, at_s)), *mean)
+                (method, at_s, theta, sd, plane, *largest, reason, *np.rad2deg(quantiles_at(any_time, at_s)), *mean)
             )
         nothing = [np.nan] * (len(QUANTILE_COLUMNS) + 2)
         rows += [(method, at_s, *[np.nan] * 5, str(reason), *nothing) for method, reason in self.refused.items()]
@@ -154,12 +155,22 @@ class Deflections(Tabular):
         return pd.DataFrame(rows, columns=[*names, *QUANTILE_COLUMNS, "mean_deg", "mean_sd_deg"])
 
     def _about(self) -> str:
-        shown = [
-            f"{method} {np.rad2deg(theta):.2f} +/- {np.rad2deg(sd):.2f} deg"
-            for method, (theta, sd) in ((m, h.at(self.reference_s)) for m, h in self.continuous.items())
-        ]
+        shown = []
+        for method, history in self.continuous.items():
+            theta, sd = np.rad2deg(history.at(self.reference_s))
+            known = f"{theta:.2f} +/- {sd:.2f} deg" if np.isfinite(theta) else no_answer_at(history, self.reference_s)
+            shown.append(f"{method} {known}")
         answers = f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
         return f"{self.doubt}; {answers}" if self.doubt else answers
+
+
+def no_answer_at(history: DeflectionHistory, at_s: float) -> Fault:
+    """Why a history with answers has none at a time, which lies outside them or in a gap."""
+    known = history.time_s[np.isfinite(history.theta_rad)]
+    first, last = float(known[0]), float(known[-1])
+    where = "a gap" if first < at_s < last else "the data begin" if at_s <= first else "the data end"
+    words = f"no answer at {at_s:.2f} s: {where}; answers span {first:.2f} to {last:.2f} s"
+    return Fault(words, "no-answer")
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:

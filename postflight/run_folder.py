@@ -37,7 +37,7 @@ from flightmodel.earth import WGS84, name_of
 from flightmodel.files import abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Finding, Telemetry
-from postflight.deflections import Deflections, quantiles_at
+from postflight.deflections import Deflections, no_answer_at, quantiles_at
 from postflight.filming import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.consistency import ConsistencyCheck
@@ -237,7 +237,6 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     for method, history in answers.histories.items():
         any_time = answers.continuous[method]
         theta, sd = np.rad2deg(any_time.at(at_s))
-        known = history.time_s[np.isfinite(history.theta_rad)]
         largest = history.largest(answers.pulse_s)
         quantiles = np.rad2deg(quantiles_at(any_time, at_s))
         out[method] = {
@@ -252,9 +251,8 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
             mean, mean_sd = np.rad2deg(mean_over(any_time, cycle))
             out[method] |= {"mean_deg": float(mean), "mean_sd_deg": float(mean_sd), "mean_over_s": list(cycle)}
         if not np.isfinite(theta):
-            gap = ": a gap" if known[0] < at_s < known[-1] else ""
-            words = f"no data at {at_s:.2f} s{gap}; answers span {known[0]:.2f} to {known[-1]:.2f} s"
-            out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": words, "code": "no-answer"}
+            reason = no_answer_at(any_time, at_s)
+            out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": reason, "code": reason.code}
     for method, reason in answers.refused.items():
         out[method] = {
             "deflection_deg": None,

@@ -183,6 +183,20 @@ def test_trackers_whose_time_tags_are_late_are_named_first(flight, monkeypatch):
     assert named in str(fault.value)
 
 
+def test_an_answer_that_is_missing_at_the_data_s_end_has_its_reason(flight):
+    """Forces are means over readings on both sides: at the last of them there is none."""
+    short = pf.fuse(pf.reconstruct(flight.with_(end_s=435.0)))
+    table = short.to_frame().set_index("method")
+    assert table["theta_deg"].isna().all()
+    for method, history in short.histories.items():
+        last_s = history.time_s[np.isfinite(history.theta_rad)][-1]
+        numbers = numbers_in(table.loc[method, "reason"])
+        assert numbers[0] == pytest.approx(short.reference_s, abs=0.01)
+        assert numbers[-1] == pytest.approx(last_s, abs=0.01)
+        assert table.loc[method, "reason"] in repr(short)
+    assert "nan" not in repr(short)
+
+
 def doubt_of(found):
     failed = [check.name for check in found.consistency_checks if not check.passed]
     return doubt(failed, len(found.consistency_checks))
