@@ -31,11 +31,13 @@ from scipy.special import ndtri
 from estimators.evidence import CONSTANT_PART
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory
+from flightmodel.statistics import chi_square_quantile
 
 SPAN_S = 1.6  # a period of the slow aerodynamic mode
 LEAST_SPANS = 4  # two on either side of the peak, for a line each
 _MOST_LOG_SD = 3.0  # of offset or margin: a factor of twenty
 CONFIDENCE = 0.90  # of the interval, as of the reconciliation's
+_SURE = 0.999  # of what is said to be hysteresis, or no static deflection: one false alarm in a thousand
 LEFT_OUT = 0.10  # sd of means against the static line, of the deflection at peak; elsewhere as the period, 1/sqrt(q)
 _LOG_BEYOND = (-27.0, 27.0)  # of the critical load over the largest, less one: a double has no more
 _MOST_LOADS = 50.0  # the stiffness of a joint this many times stiffer than its load is not observable
@@ -93,9 +95,11 @@ def southwell_limbs(
     Raises
     ------
     DivergenceError
-        Where the whole pulse gives no line; a limb that gives none is left out, with a remark.
+        Where the means do not stay in one plane, or the whole pulse gives no line; a limb that gives none is left out,
+        with a remark.
     """
-    t, q, theta, sd = _span_means(history, time_s, pressure_pa)
+    t, q, theta, across, sd, across_sd = _span_means(history, time_s, pressure_pa)
+    _check_static(q, theta, across, across_sd)
     both = southwell(q, theta, sd, pressure_sd)
     top = t[np.argmax(q)]
     limbs: dict[str, Southwell | None] = {}
@@ -112,16 +116,14 @@ def southwell_limbs(
         middle = np.array([0.8 * float(q.max())])
         change = float(np.log(fall.deflection(middle)[0] / rise.deflection(middle)[0]))
         apart = change / float(np.hypot(_log_sd(rise, middle[0]), _log_sd(fall, middle[0])))
-        limit = ndtri(0.5 + 0.5 * CONFIDENCE)
+        limit = ndtri(0.5 + 0.5 * _SURE)
         found = "hysteresis" if abs(apart) > limit else "no significant hysteresis"
         remarks.insert(0, f"fall over rise {np.exp(change):.2f} at 80 % of peak load ({apart:+.1f} sd): {found}")
     return Limbs(both, rise, fall, apart, "; ".join(remarks))
 
 
-def _span_means(
-    history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Means over spans: time, pressure, deflection along its mean direction, and its sd."""
+def _span_means(history: DeflectionHistory, time_s: FloatArray, pressure_pa: FloatArray) -> tuple[FloatArray, ...]:
+    """Means over spans: time, pressure, deflection along its mean direction and across it, and the sd of both."""
     cov = history.lateral_cov
     known = np.isfinite(history.theta_rad) & np.isfinite(cov[:, 0, 0])
     t, yz, cov = history.time_s[known], history.theta_yz_rad[known], cov[known]
@@ -131,10 +133,28 @@ def _span_means(
     weight = q / np.trace(cov, axis1=1, axis2=2)
     direction = weight @ yz
     direction = direction / np.linalg.norm(direction)
-    along, sd = yz @ direction, np.sqrt(np.einsum("i,nij,j->n", direction, cov, direction))
+    axes = (direction, np.array([-direction[1], direction[0]]))
+    sds = [np.sqrt(np.einsum("i,nij,j->n", axis, cov, axis)) for axis in axes]
     _, which, count = np.unique(np.floor((t - t[0]) / SPAN_S), return_inverse=True, return_counts=True)
-    mean = [np.bincount(which, v) / count for v in (t, q, along, sd)]
-    return mean[0], mean[1], mean[2], mean[3]
+    return tuple(np.bincount(which, v) / count for v in (t, q, *(yz @ axis for axis in axes), *sds))
+
+
+def _check_static(pressure_pa: FloatArray, theta_rad: FloatArray, across_rad: FloatArray, sd_rad: FloatArray) -> None:
+    """Raise `DivergenceError` where means lie farther across their direction than a static deflection's may.
+
+    An offset of the vehicle deflects the shell in one plane. A vehicle that spins about as fast as it pitches swings
+    slowly in its own axes; means over `SPAN_S` then follow the swing, across that plane as along it.
+    """
+    if not len(pressure_pa):
+        return
+    left_out = (LEFT_OUT * theta_rad) ** 2 * pressure_pa.max() / pressure_pa
+    found = float(np.sum(across_rad**2 / (sd_rad**2 + left_out)))
+    if found > chi_square_quantile(_SURE, len(across_rad)):
+        raise DivergenceError(
+            f"Southwell plot: means over {SPAN_S} s lie {np.sqrt(found / len(across_rad)):.1f} times as far across the "
+            "deflection's plane as a static deflection's do: the vehicle swings as slowly as it spins",
+            code="deflection-not-static",
+        )
 
 
 def southwell(

@@ -1,8 +1,8 @@
 """Do frames with little load show the shell at rest, as the benchmark frame is taken to?
 
 A benchmark frame under load, or a camera that has moved in its mount since, shows in frames with little load as a
-deflection that no load explains. Of the frames whose load ``l_k`` is at most a tenth of the film's largest, those
-before it and those after it apart, the readings ``r_k`` and their covariances ``S_k`` give
+deflection that no load explains. Of the frames before the first, and apart of those after the last, whose load
+``l_k`` is more than a tenth of the film's largest, the readings ``r_k`` and their covariances ``S_k`` give
 
     m = sum w_k r_k,    C = sum w_k V_k + p^2 I,    V_k = S_k + (2 u l_k)^2 I,    w_k ~ 1 / trace V_k
 
@@ -121,11 +121,11 @@ def rest_of(
         return None if corrected else _by_sides(history.time_s, theta, covariance, answered, at, prior_sd_rad)
     per_load = np.linalg.norm(theta[known], axis=1).max() / np.abs(load[known] - load[at]).max()
     largest = max(load[known].max(), load[at])
-    little = known & (load <= _LITTLE * largest)
+    loaded = history.time_s[(known | ~other) & (load > _LITTLE * largest)]
+    before, after = history.time_s < loaded.min(), history.time_s > loaded.max()  # a swing's own zeros lie between
+    little = known & (before | after)
     if little.any():
-        loaded = np.where(known | ~other, load, -np.inf)
-        before = history.time_s < history.time_s[int(np.argmax(loaded))]
-        groups = [rows for side in (before, ~before) if len(rows := np.flatnonzero(little & side))]
+        groups = [rows for side in (before, after) if len(rows := np.flatnonzero(little & side))]
         limit = float(np.sqrt(chi_square_quantile(1.0 - (1.0 - CONFIDENCE) / len(groups), 2)))
         found = []
         for rows in groups:
