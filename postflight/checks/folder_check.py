@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from rich.table import Table
 from flightmodel import earth
 from flightmodel.checks import Fault, FloatArray, GateError
 from flightmodel.config import FILL_IN, read_toml
-from flightmodel.film import Frames
+from flightmodel.film import NO_PICTURE, Frames, film_fault, image_fault
 from flightmodel.flightfolder import Sources, assumed_errors, read_sources
+from flightmodel.gate import FROZEN_S
 from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
@@ -38,6 +40,7 @@ from postflight.terminal import few_of_each, terminal
 
 _FORCE_WIDTH_S = 8.0  # the second derivative of a radar track of 5 m at 10 Hz is then good to 0.25 m/s2
 WIDE = 160  # of a log file: a table need not be squeezed there
+_FROZEN_FRAMES = 3  # two may be those of a changed frame rate
 _LONGEST_NAME = 28  # that leaves room for the rest of a table on 80 columns
 console = terminal(width=None if sys.stdout.isatty() else WIDE)
 
@@ -256,7 +259,7 @@ def _cross_check(found: Sources, report: Report) -> None:
     remarks += rotation
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
-    report.findings += text_in_films(found)
+    report.findings += text_in_films(found) + frozen_films(found)
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
@@ -394,4 +397,27 @@ def text_in_films(found: Sources) -> list[Finding]:
             share = f"{100.0 * np.mean(hidden):.0f} % of the picture"
             words = f"text burnt into the film, or dead lines of its detector: {share} is left out"
             out.append(Finding(name, words, float(frames.time_s[0]), float(frames.time_s[-1]), code="text-burnt-in"))
+    return out
+
+
+def frozen_films(found: Sources) -> list[Finding]:
+    """Find pictures that a film repeats to the last bit, which noise forbids: ``film-frozen`` for each stretch."""
+    return [one for name, film in found.films.items() for one in _repeats(name, film)]
+
+
+def _repeats(name: str, film: Frames) -> list[Finding]:
+    filed_px = film.filed_px or film.camera.size_px
+    last = 0 if film.numbers is None else int(film.numbers[-1])
+    fault = (lambda path: film_fault(path, filed_px, last)) if last else (lambda path: image_fault(path, filed_px))
+    if not len(film.time_s) or any(map(fault, film.paths)):
+        return []
+    out, first, before = [], 0, NO_PICTURE
+    for k, now in enumerate(chain(film.pictures(), [NO_PICTURE])):
+        if k and now.size and np.array_equal(now, before):
+            continue
+        start, end = float(film.time_s[first]), float(film.time_s[max(k - 1, 0)])
+        if k - first >= _FROZEN_FRAMES and end - start >= FROZEN_S:
+            words = f"{k - first} frames repeat one picture: the film stood still there; leave them out (use_s)"
+            out.append(Finding(name, words, start, end, "film-frozen"))
+        first, before = k, now
     return out

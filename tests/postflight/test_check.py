@@ -5,15 +5,19 @@ import os
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
+from flightmodel.film import Frames
+from flightmodel.vehicle import read_vehicle
 from postflight.checks import folder_check
-from postflight.checks.folder_check import Fact, Report, check_folder
+from postflight.checks.folder_check import Fact, Report, check_folder, frozen_films
 from postflight.cli import cli
 from tests.oracles import mars_entry
 from tests.refusing import numbers_in
@@ -416,3 +420,18 @@ def test_folder_without_flight_toml_is_refused(tmp_path):
     result = CliRunner().invoke(cli, ["check", str(tmp_path), "--json"])
     assert result.exit_code == 2
     assert json.loads(result.stdout)["refused_codes"] == ["file-missing"]
+
+
+def test_a_film_that_stands_still_is_named_with_its_span(tmp_path):
+    """Eight noisy frames, of which the third stands for 1 s, and the last two are alike as by a changed frame rate."""
+    rng, camera = np.random.default_rng(0), read_vehicle("irve2_reference").cameras["camera5"]
+    seen = [rng.integers(0, 255, camera.size_px[::-1], dtype=np.uint8) for _ in range(5)]
+    paths = []
+    for k, which in enumerate([0, 1, 2, 2, 2, 3, 4, 4]):
+        paths.append(tmp_path / f"{k}.png")
+        cv2.imwrite(str(paths[-1]), seen[which])
+    film = Frames(camera, "camera5", np.arange(8) * 0.5, tuple(paths), 0.0)
+    (only,) = frozen_films(SimpleNamespace(films={"frames": film}))
+    assert (only.source, only.code, only.start_s, only.end_s) == ("frames", "film-frozen", 1.0, 2.0)
+    (tmp_path / "3.png").write_bytes(b"no picture")
+    assert frozen_films(SimpleNamespace(films={"frames": film})) == []
