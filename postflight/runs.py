@@ -212,7 +212,9 @@ def read_tables(run: Path) -> RunTables:
         tables = {p.stem: read_csv(p) for p in sorted(run.glob("*.csv"))}
     except (OSError, ValueError) as fault:
         raise GateError(f"{run}: not a whole run ({fault}); {again}", "run-incomplete") from None
-    missing = [f"{name}.csv" for name in _NEEDED if name not in tables]
+    answered = [m for m, row in (summary.get("methods") or {}).items() if row.get("deflection_deg") is not None]
+    needed = (*_NEEDED, *(answer_table(method, tables) for method in answered))
+    missing = [f"{name}.csv" for name in needed if name not in tables]
     if missing:
         raise GateError(f"{run}: not a whole run, without {', '.join(missing)}; {again}", "run-incomplete")
     return RunTables(run, summary, facts_of(run), header, tables)

@@ -21,6 +21,7 @@ from postflight.report import text as texts
 from postflight.report.panels import trajectory_panels, trajectory_rows
 from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
+from postflight.runs import read_tables
 from recon.consistency import doubt
 from tests.postflight.report.conftest import HOSTILE
 
@@ -319,6 +320,17 @@ def test_changed_telemetry_is_refused(rocket: Path, tmp_path: Path) -> None:
         read_run(tmp_path / "flight")
     assert refusal.value.codes == ("inputs-changed",)
     assert "flight.toml" in str(refusal.value)
+
+
+def test_a_run_without_the_table_of_an_answer_is_refused(reported: Path, tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "20260101T000000Z-00000000"
+    shutil.copytree(next((reported / "runs").iterdir()), run)
+    assert read_tables(run).history("fused") is not None
+    (run / "deflection_fused.csv").unlink()
+    with pytest.raises(GateError) as refusal:
+        read_tables(run)
+    assert refusal.value.codes == ("run-incomplete",)
+    assert "deflection_fused.csv" in str(refusal.value)
 
 
 @pytest.mark.parametrize("name", ["bet.csv", "summary.json", "residuals.csv"])
