@@ -437,16 +437,20 @@ def print_answers(answers: Deflections) -> None:
             console.print(escape(check.remark))
         else:
             console.coded("[red]check failed[/]", check.remark, check.code)
-    passed = sum(check.passed for check in answers.consistency_checks)
-    console.print(f"{passed} of {len(answers.consistency_checks)} consistency checks of the deflection pass")
+    if answers.consistency_checks:
+        passed = sum(check.passed for check in answers.consistency_checks)
+        console.print(f"{passed} of {len(answers.consistency_checks)} consistency checks of the deflection pass")
     bias = None if answers.fused is None else answers.fused.camera_time_bias
     if bias is not None and bias.applied:
         console.print(escape(bias.remark))
     if answers.camera is not None and answers.camera.shape is not None:
         console.print(f"shell's shape under load, by video: {escape(answers.camera.shape.verdict)}")
+    none: dict[tuple[str, str], list[str]] = {}
     for method, row in run_folder.method_summary(answers, at_s).items():
         if "reason" in row:
-            console.coded("[yellow]no answer[/]", f"from {method}: {row['reason']}", row["code"])
+            none.setdefault((row["reason"], row["code"]), []).append(method)
+    for (reason, code), methods in none.items():
+        console.coded("[yellow]no answer[/]", f"from {', '.join(methods)}: {reason}", code)
 
 
 def deflection(
