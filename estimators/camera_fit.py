@@ -138,6 +138,7 @@ class OrientedCamera(FrameModel):
             return refused_fit(no_horizon(fault), fault)
         deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
         deformation[:2] = 0.0 if start is None else start
+        with_open_plane: FrameFit | None = None
         mount_px = self._mount_px(frame)
         try:
             painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
@@ -166,6 +167,7 @@ class OrientedCamera(FrameModel):
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
+                with_open_plane = self._answer(horizon, deformation, last, basis)
                 basis = plane_axis[:, None]
                 horizon = self.coherent_edge(frame, deformation)
                 # what the plane does not explain is more than any point's own error: all count alike
@@ -175,7 +177,9 @@ class OrientedCamera(FrameModel):
         except NoFitError as refusal:
             return refused_fit(horizon, refusal.faults[0], mount_px)
         answer = self._answer(horizon, deformation, last, basis)
-        return replace(answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px)
+        return replace(
+            answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px, with_open_plane=with_open_plane
+        )  # fmt: skip
 
     def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
         """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.

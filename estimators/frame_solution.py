@@ -136,6 +136,8 @@ class FrameFit:
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None
         Error per unit error of the shell's shape under load as the film determined it, where that was used.
+    with_open_plane : FrameFit or None
+        Of the same frame with its plane estimated, where one is assumed.
     """
 
     rotation_yz_rad: FloatArray
@@ -152,6 +154,7 @@ class FrameFit:
     mount_px: float = float("nan")
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
+    with_open_plane: FrameFit | None = None
 
 
 class NoFitError(GateError):

@@ -125,7 +125,7 @@ class DeflectionHistory(Tabular):
         known = np.isfinite(self.theta_rad)
         if not known.any():
             return f"{self.method}, no answer"
-        k = int(np.nanargmax(self.theta_rad))
+        k = self.largest()
         largest = f"largest {np.rad2deg(self.theta_rad[k]):.2f} deg at {self.time_s[k]:.2f} s"
         return f"{self.method}, {known.sum()} samples, {largest}"
 
@@ -182,10 +182,10 @@ class DeflectionHistory(Tabular):
         return cov
 
     def largest(self, within_s: tuple[float, float] = (-np.inf, np.inf)) -> int:
-        """Number of the largest answer within a span of time; of all where there is none in it."""
+        """Number of the largest answer, of either sign, within a span of time; of all where there is none in it."""
         inside = (self.time_s >= within_s[0]) & (self.time_s <= within_s[1]) & np.isfinite(self.theta_rad)
         size = np.where(inside, self.theta_rad, np.nan) if inside.any() else self.theta_rad
-        return int(np.nanargmax(size))
+        return int(np.nanargmax(np.abs(size)))
 
     def at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.

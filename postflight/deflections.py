@@ -81,7 +81,7 @@ class Deflections(Tabular):
         """Time at which methods are compared, s: peak dynamic pressure, else the first history's largest deflection."""
         if self.bet is not None:
             return self.bet.peak_s
-        return next((float(h.time_s[np.nanargmax(h.theta_rad)]) for h in self.histories.values()), float("nan"))
+        return next((float(h.time_s[h.largest()]) for h in self.histories.values()), float("nan"))
 
     @property
     def pulse_s(self) -> tuple[float, float]:
@@ -373,7 +373,7 @@ def camera_sensitivity(flight: Flight, history: DeflectionHistory) -> pd.DataFra
     telemetry, history = with_largest(flight.telemetry, history)
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
-    straight, deflected = (frames.picture(k) for k in (frames.benchmark, int(np.nanargmax(history.theta_rad))))
+    straight, deflected = (frames.picture(k) for k in (frames.benchmark, history.largest()))
     stations = np.array([0.0, vehicle.joint.station_m])
     planes = np.deg2rad(list(PAPER_TABLE_2_1_DEG))
     angles = sensitivity_table(straight, deflected, vehicle.geometry, frames.camera, planes, stations)

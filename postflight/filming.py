@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.agreement import CONFIDENCE
+from estimators.assumed_plane import PlaneTest, plane_test
 from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, joint_moment, orient_camera
 from estimators.camera import FilmFit, JointSwing, read_film
 from estimators.camera_fit import OrientedCamera
@@ -62,6 +63,8 @@ class CameraAnswer:
         How the shell's shape followed the load; None where nothing determines it (why stands in the assumptions).
     rests : dict of Rest
         Of each camera whose film can tell: whether its benchmark frame is one at rest.
+    plane : PlaneTest or None
+        Whether the film bears out the plane that is assumed.
     """
 
     history: DeflectionHistory
@@ -73,6 +76,7 @@ class CameraAnswer:
     benchmarks_s: tuple[float, ...]
     shape: ShellShape | None = None
     rests: dict[str, Rest] = field(default_factory=dict)
+    plane: PlaneTest | None = None
 
     @property
     def has_only_benchmarks(self) -> bool:
@@ -82,7 +86,7 @@ class CameraAnswer:
 
     @property
     def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether each camera's shell rests without load; of several, whether they agree and each has an answer."""
+        """Whether each camera's shell rests without load, and in the assumed plane; whether several cameras agree."""
         checks = [
             ConsistencyCheck(
                 "camera-rest", f"{name}: deflection without load over its sd", rest.over_sd, 0.0, rest.limit,
@@ -90,6 +94,11 @@ class CameraAnswer:
             )
             for name, rest in self.rests.items()
         ]  # fmt: skip
+        if self.plane is not None:
+            name, of = "deflection that the assumed plane leaves out, over its sd", self.plane
+            checks.append(
+                ConsistencyCheck("camera-plane", name, of.over_sd, 0.0, of.limit, of.passed, of.remark, "camera")
+            )
         if self.joined is None:
             return tuple(checks)
         if self.joined.tests:
@@ -180,7 +189,9 @@ def camera_answer(
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
-        return CameraAnswer(history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests)
+        return CameraAnswer(
+            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests, plane_test(film)
+        )
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "plane-assumed")

@@ -50,7 +50,7 @@ def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> t
     video = telemetry.frames
     assert video is not None
     oriented, benchmark = oriented_camera(telemetry, history)
-    largest = int(np.nanargmax(history.theta_rad))
+    largest = history.largest()
     shown = [(k, *deflection_at(history, float(video.time_s[k]))) for k in (benchmark, largest)]
     overlay = Overlay(oriented.view, telemetry.required_vehicle().meshes)
     first, second = (overlay.blended(video.picture(k), theta, plane) for k, theta, plane in shown)

@@ -149,7 +149,7 @@ def _draw_one_camera(flight: Flight, history: DeflectionHistory, folder: Path, e
     frames = telemetry.frames
     assert frames is not None
     oriented, benchmark = oriented_camera(telemetry, history)
-    largest = int(np.nanargmax(np.abs(history.theta_rad)))
+    largest = history.largest()
     pick = [benchmark, largest]
     times = [float(t) for t in frames.time_s[pick]]
     theta, plane = zip(*(deflection_at(history, t) for t in times), strict=True)

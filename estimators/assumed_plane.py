@@ -1,0 +1,91 @@
+"""Does a film bear out the plane in which its deflection is assumed to lie?
+
+Each frame is fitted with the plane estimated too. Of the frames in which that answer ``r`` is at least half of the
+film's largest, with the answer ``a`` in the assumed plane and both their sd ``s``,
+
+    z = (|r| - |a|) / (s_r^2 + s_a^2)^1/2
+
+is what the assumed plane leaves out over what the error bars allow: ``s_a`` holds the plane's stated sd. A film whose
+frames with hardly an exception have an ``a`` well below zero shows the opposite plane; ``-a / s_a`` stands for ``z``.
+
+Assumed: errors of ``r`` and ``a`` add up like independent ones, although they have the camera and the benchmark frame
+in common, which makes ``z`` smaller than it might be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from estimators.agreement import CONFIDENCE
+from estimators.camera import FilmFit, polar
+from flightmodel.deflection import lv_clock
+
+_LOADED = 0.5  # of the largest deflection: below, a wrong plane hides in the error bar
+_MISREAD = 10  # one frame of so many may be
+
+
+@dataclass(frozen=True)
+class PlaneTest:
+    """What a film says of the plane that is assumed.
+
+    Parameters
+    ----------
+    theta_rad, plane_lv_rad : float
+        Mean deflection of the loaded frames with the plane estimated.
+    in_plane_rad, assumed_lv_rad : float
+        Their mean answer in the assumed plane.
+    over_sd, limit : float
+        What that leaves out over its sd, of the loaded frames the worst (one of ten left out), and what passes.
+    """
+
+    theta_rad: float
+    plane_lv_rad: float
+    in_plane_rad: float
+    assumed_lv_rad: float
+    over_sd: float
+    limit: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the assumed plane explains the frames."""
+        return self.over_sd <= self.limit
+
+    @property
+    def remark(self) -> str:
+        """What was found, and where it fails what to do."""
+        size, plane, inside, assumed = np.rad2deg(
+            [self.theta_rad, self.plane_lv_rad, self.in_plane_rad, self.assumed_lv_rad]
+        )
+        found = (
+            f"camera: in the assumed plane ({assumed:.0f} deg LV) the shell is deflected by {inside:.2f} deg, with the "
+            f"plane left open by {size:.2f} deg towards {plane:.0f} deg LV (means of the frames with most)"
+        )
+        if self.passed:
+            return found
+        return f"{found}, {self.over_sd:.1f} sd apart: leave the plane open (no --plane, no camera_plane_lv_deg)"
+
+
+def plane_test(film: FilmFit) -> PlaneTest | None:
+    """Whether a film bears out its assumed plane; None where none is assumed, or no frame has an answer."""
+    fits = [fit.with_open_plane for fit in film.fits]
+    rows = np.array([k for k, fit in enumerate(fits) if fit is not None and not film.fits[k].refused], dtype=int)
+    if film.plane_lv_rad is None or not len(rows):
+        return None
+    history = film.history()
+    read = [polar(fit.rotation_yz_rad, fit.covariance) for k in rows if (fit := fits[k]) is not None]
+    size, clock, var = (np.array(x) for x in zip(*((r, p, c[0, 0]) for r, p, c in read), strict=True))
+    loaded = size >= _LOADED * size.max()
+    rows, size, clock, var = rows[loaded], size[loaded], clock[loaded], var[loaded]
+    inside, sd = history.theta_rad[rows], history.theta_sd_rad[rows]
+    apart = (size - np.abs(inside)) / np.sqrt(var + sd**2)
+    left_out = len(rows) // _MISREAD
+    over_sd = max(float(np.sort(apart)[::-1][left_out]), float(np.sort(-inside / sd)[left_out]), 0.0)
+    # of ten frames and more one is left out: that two exceed a limit is less likely than that one of ten does
+    limit = float(ndtri(1.0 - (1.0 - CONFIDENCE) / min(len(rows), _MISREAD)))
+    mean = np.mean(size[:, None] * np.column_stack([-np.cos(clock), np.sin(clock)]), axis=0)
+    return PlaneTest(
+        float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd, limit
+    )  # fmt: skip
