@@ -6,10 +6,11 @@ film's largest, with the answer ``a`` in the assumed plane and both their sd ``s
     z = (|r| - |a|) / (s_r^2 + s_a^2)^1/2
 
 is what the assumed plane leaves out over what the error bars allow: ``s_a`` holds the plane's stated sd. A film whose
-frames with hardly an exception have an ``a`` well below zero shows the opposite plane; ``-a / s_a`` stands for ``z``.
+frames with hardly an exception have an ``a`` well below zero shows the opposite plane: ``-a`` over the sd that the
+frame alone gives it stands for ``z``, because no error of the plane by less than a right angle turns its sign.
 
 Assumed: errors of ``r`` and ``a`` add up like independent ones, although they have the camera and the benchmark frame
-in common, which makes ``z`` smaller than it might be.
+in common, which makes ``z`` smaller than it might be; the frames err together, so that all have the limit of one.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from flightmodel.deflection import lv_clock
 
 _LOADED = 0.5  # of the largest deflection: below, a wrong plane hides in the error bar
 _MISREAD = 10  # one frame of so many may be
+LIMIT_SD = float(ndtri(CONFIDENCE))
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class PlaneTest:
         Mean deflection of the loaded frames with the plane estimated.
     in_plane_rad, assumed_lv_rad : float
         Their mean answer in the assumed plane.
-    over_sd, limit : float
-        What that leaves out over its sd, of the loaded frames the worst (one of ten left out), and what passes.
+    over_sd : float
+        What that leaves out over its sd, of the loaded frames the worst (one of ten left out).
     """
 
     theta_rad: float
@@ -46,12 +48,11 @@ class PlaneTest:
     in_plane_rad: float
     assumed_lv_rad: float
     over_sd: float
-    limit: float
 
     @property
     def passed(self) -> bool:
         """Whether the assumed plane explains the frames."""
-        return self.over_sd <= self.limit
+        return self.over_sd <= LIMIT_SD
 
     @property
     def remark(self) -> str:
@@ -80,12 +81,11 @@ def plane_test(film: FilmFit) -> PlaneTest | None:
     loaded = size >= _LOADED * size.max()
     rows, size, clock, var = rows[loaded], size[loaded], clock[loaded], var[loaded]
     inside, sd = history.theta_rad[rows], history.theta_sd_rad[rows]
+    own_sd = np.sqrt([film.fits[k].covariance[0, 0] for k in rows])
     apart = (size - np.abs(inside)) / np.sqrt(var + sd**2)
     left_out = len(rows) // _MISREAD
-    over_sd = max(float(np.sort(apart)[::-1][left_out]), float(np.sort(-inside / sd)[left_out]), 0.0)
-    # of ten frames and more one is left out: that two exceed a limit is less likely than that one of ten does
-    limit = float(ndtri(1.0 - (1.0 - CONFIDENCE) / min(len(rows), _MISREAD)))
+    over_sd = max(float(np.sort(apart)[::-1][left_out]), float(np.sort(-inside / own_sd)[left_out]), 0.0)
     mean = np.mean(size[:, None] * np.column_stack([-np.cos(clock), np.sin(clock)]), axis=0)
     return PlaneTest(
-        float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd, limit
+        float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd
     )  # fmt: skip

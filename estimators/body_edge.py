@@ -20,7 +20,7 @@ from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, sample
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 
-_EVERY_PX = 4  # along the silhouette
+_EVERY_PX = 2  # along the silhouette
 _REACH_PX = 24.0  # of a camera of which an inch of height over the skin is not known
 _LEVEL = 12  # samples of the plain body
 _HALF = 4  # samples on either side of a step

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from estimators.agreement import CONFIDENCE
-from estimators.assumed_plane import PlaneTest, plane_test
+from estimators.assumed_plane import LIMIT_SD, PlaneTest, plane_test
 from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, joint_moment, orient_camera
 from estimators.camera import FilmFit, JointSwing, read_film
 from estimators.camera_fit import OrientedCamera
@@ -65,6 +65,9 @@ class CameraAnswer:
         Of each camera whose film can tell: whether its benchmark frame is one at rest.
     plane : PlaneTest or None
         Whether the film bears out the plane that is assumed.
+    unfounded : dict of Fault
+        Of each camera, where the vehicle file states features: why its benchmark frame does not show them; empty where
+        it does.
     """
 
     history: DeflectionHistory
@@ -77,6 +80,7 @@ class CameraAnswer:
     shape: ShellShape | None = None
     rests: dict[str, Rest] = field(default_factory=dict)
     plane: PlaneTest | None = None
+    unfounded: dict[str, Fault] = field(default_factory=dict)
 
     @property
     def has_only_benchmarks(self) -> bool:
@@ -94,10 +98,19 @@ class CameraAnswer:
             )
             for name, rest in self.rests.items()
         ]  # fmt: skip
+        for camera, why in self.unfounded.items():
+            words = f"{camera}: the benchmark frame shows the features that the vehicle file states"
+            if why:
+                words = (
+                    f"{camera}: {why}; the answers go by edge and texture, and the vehicle file may be wrong in more than "
+                    f'features: check its outline, mount and lens, or state features = "texture"'
+                )
+            source, name = "camera" if self.joined is None else camera, f"{camera}: stated features not found"
+            checks.append(ConsistencyCheck("camera-features", name, float(bool(why)), 0.0, 0.0, not why, words, source))
         if self.plane is not None:
             name, of = "deflection that the assumed plane leaves out, over its sd", self.plane
             checks.append(
-                ConsistencyCheck("camera-plane", name, of.over_sd, 0.0, of.limit, of.passed, of.remark, "camera")
+                ConsistencyCheck("camera-plane", name, of.over_sd, 0.0, LIMIT_SD, of.passed, of.remark, "camera")
             )
         if self.joined is None:
             return tuple(checks)
@@ -190,8 +203,9 @@ def camera_answer(
         table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
         return CameraAnswer(
-            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests, plane_test(film)
-        )
+            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests, plane_test(film),
+            _unfounded(shaped, flight),
+        )  # fmt: skip
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "plane-assumed")
@@ -241,7 +255,10 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
     times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
-    return CameraAnswer(history, at_plain.at_frames, smooth, frames, joined, refused, times, shape, rests)
+    return CameraAnswer(
+        history, at_plain.at_frames, smooth, frames, joined, refused, times, shape, rests,
+        unfounded=_unfounded(films, flight),
+    )  # fmt: skip
 
 
 def _with_shell_shape(
@@ -280,6 +297,13 @@ def _benchmark(
         return benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad), ""
     except GateError as fault:
         return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
+
+
+def _unfounded(films: dict[str, FilmFit], flight: Flight) -> dict[str, Fault]:
+    """Of each film, where the vehicle file states features: why they are not used, empty where they are."""
+    if flight.telemetry.required_vehicle().geometry.features in ("none", "texture"):
+        return {}
+    return {name: film.oriented.stated_refused for name, film in films.items()}
 
 
 def _rests(
