@@ -152,6 +152,10 @@ class Agreement:
     @property
     def remark(self) -> str:
         """One sentence."""
+        return self.explained("")
+
+    def explained(self, cause: str) -> str:
+        """One sentence; ``cause``: what is found wrong by itself, before which no input is suspected."""
         if not self.pairs:
             return "only one method has an answer: no independent measurement to compare it with"
         failed = [f"{a} and {b}" for a, b in (p.methods for p in self.pairs if not p.passed)]
@@ -159,6 +163,7 @@ class Agreement:
             return "the methods agree within their stated uncertainties"
         named = " or the ".join(self.likeliest)
         would = f": an error of the {named} explains it best" if named else ", and no error of one input explains it"
+        would = f": {cause}" if cause else would
         return f"{', '.join(failed) or 'the methods'} disagree beyond their stated uncertainties{would}"
 
 

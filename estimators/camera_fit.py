@@ -87,8 +87,8 @@ _WHOLE_EDGE = 0.8  # of the benchmark's edge points
 _SOUND_EDGE = 0.5  # of the edge in view, for an answer without features
 # of the benchmark frame's edge or features, for an answer by both: of 3573 sound answers in spoilt films one shows less
 _LITTLE_SEEN = 0.4
-# beside hardly any of the features more of the edge is wanted, part of which passes for that of a shell degrees away: of
-# 2225 sound answers in spoilt films six show less, four of them with blocks of other frames
+# beside hardly any of the features more of the edge is wanted, part of which passes for that of a shell degrees away:
+# of 2225 sound answers in spoilt films six show less, four of them with blocks of other frames
 _HARDLY_FEATURES, _EDGE_BESIDE = 0.2, 0.7
 USUAL_SHARE = 0.75  # features shown by a benchmark frame that is not suspicious
 

@@ -317,9 +317,8 @@ def with_increments(answers: Deflections) -> Deflections:
     """
     if answers.fused is None or answers.bet is None:
         return answers
-    confidence, name = answers.bet.solution.settings.check_confidence, answers.bet.telemetry.name
     try:
-        return replace(answers, increments=increments_of(answers.fused, confidence, name))
+        return replace(answers, increments=_increments(answers.fused, answers.bet))
     except GateError as fault:
         return replace(answers, no_increments=Fault(str(fault), fault.codes[0]))
 
@@ -346,7 +345,18 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
         raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "answers-of-another")
     if found.fused is None:
         raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
-    return increments_of(found.fused, bet.solution.settings.check_confidence, bet.telemetry.name)
+    return _increments(found.fused, bet)
+
+
+def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
+    """Increments; where there are none because of a late film, that is said first."""
+    try:
+        return increments_of(fused, bet.solution.settings.check_confidence, bet.telemetry.name)
+    except GateError as fault:
+        bias = fused.camera_time_bias
+        if bias is None or not bias.is_off:
+            raise
+        raise GateError(f"{bias.cause}; {fault}", fault.codes[0]) from None
 
 
 def _part(report: Progress, number: int, parts: int) -> Progress:

@@ -67,6 +67,11 @@ class CameraTimeBias:
         return f"camera time bias {bias_s:+.3f} s, late positive (1 sd {self.sd_s:.3f} s), {used}"
 
     @property
+    def cause(self) -> str:
+        """What to correct before anything else is suspected; empty where the bias is not off."""
+        return f"the film's time tags come first ({self.remark}), correct them in frames.csv" if self.is_off else ""
+
+    @property
     def is_off(self) -> bool:
         """Whether a bias stated as zero is significant."""
         return not self.applied and abs(self.offset_s) > _OFF_SD * self.sd_s
@@ -105,7 +110,8 @@ class FusedAnswer:
     @property
     def remark(self) -> str:
         """Whether the methods agree, and what was made of it where they do not."""
-        words = self.agreement.remark
+        bias = self.camera_time_bias
+        words = self.agreement.explained("" if bias is None else bias.cause)
         if self.left_out is not None:
             words += f"; the {self.left_out} contradicts the others, which agree without it: it is left out"
         if self.alternatives:
@@ -122,13 +128,14 @@ class FusedAnswer:
         likeliest = self.agreement.likeliest
         least = min((p.p_value for p in self.agreement.pairs), default=1.0)
         # a method that is no sensor is wrong by an input of its own
-        blamed = "camera" if self.left_out == "camera" else ", ".join(likeliest) or self.left_out or ""
+        bias = self.camera_time_bias
+        is_late = bias is not None and bias.is_off
+        blamed = "camera" if is_late or self.left_out == "camera" else ", ".join(likeliest) or self.left_out or ""
         source = "" if passed else blamed
         name = "deflection methods agree: least chance of a pair"
         checks = [
             ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)
         ]
-        bias = self.camera_time_bias
         if bias is not None and not bias.applied:
             size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
             name = "camera time bias over its sd"
@@ -383,10 +390,9 @@ def _explained(
     fault: DivergenceError, sources: _Sources, bias_sd_s: float, bias: CameraTimeBias | None
 ) -> DivergenceError:
     """A failed fusion with the fault hypotheses, and the camera time bias with which there is an answer."""
-    message = f"{fault}; {sources.tested(fault, bias_sd_s).remark}"
     if bias is None or not bias.is_off:
-        return DivergenceError(message, code=fault.codes[0])
-    return DivergenceError(f"{message}; there is an answer with a {bias.remark}", code="camera-time-bias")
+        return DivergenceError(f"{fault}; {sources.tested(fault, bias_sd_s).remark}", code=fault.codes[0])
+    return DivergenceError(f"{bias.cause}: with it there is a common answer; {fault}", code="camera-time-bias")
 
 
 def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:

@@ -192,6 +192,10 @@ def test_a_time_bias_that_leaves_no_common_answer_is_named():
     assert answer.camera_time_bias.offset_s == pytest.approx(0.3, abs=0.02)
     red = {check.code for check in answer.consistency_checks if not check.passed}
     assert red == {"deflection-methods", "camera-time-bias"}
+    # whatever else might explain the contradiction, the film comes first
+    assert answer.camera_time_bias.cause in answer.remark
+    on_time = fuse_flight(loads, history_from_lateral(TIME_S, truth, cov, "camera", "")).camera_time_bias
+    assert not on_time.cause
 
 
 def test_the_smooth_history_errs_less_than_the_frames_and_says_how_much():

@@ -4,17 +4,19 @@ import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from estimators.increments import COEFFICIENTS, STATED
 from flightmodel.aerodynamics import read_with_sidecar, referred_to
-from flightmodel.checks import Fault, GateError
+from flightmodel.checks import DivergenceError, Fault, GateError
 from flightmodel.vehicle import DATA, vehicle_from_toml
+from postflight import deflections
 from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.flown_coefficients import TABLE, increments_of
-from postflight.fusing import fuse_flight
+from postflight.fusing import CameraTimeBias, fuse_flight
 from postflight.plots.deflection import figure_increments
 from postflight.reconstruction import Reconstruction
 from postflight.run_folder import increments_summary
@@ -127,6 +129,23 @@ def test_answers_carry_increments_or_why_there_are_none():
     whole = replace(none, fused=answer(), increments=found())
     assert "aero-increment" in {check.code for check in whole.consistency_checks}
     assert increments_summary(whole)["mach"] == found().summary()["mach"]
+
+
+def test_without_increments_a_late_film_is_said_first(monkeypatch):
+    """The reader is sent to the film's time tags, not to the coefficient table alone."""
+
+    def unsettled(*_):
+        raise DivergenceError("they do not settle", code="increments-not-converged")
+
+    monkeypatch.setattr(deflections, "increments_of", unsettled)
+    settings = SimpleNamespace(check_confidence=CONFIDENCE)
+    bet = SimpleNamespace(solution=SimpleNamespace(settings=settings), telemetry=SimpleNamespace(name="late"))
+    late, on_time = (CameraTimeBias(offset, 0.01, False) for offset in (1.0, 0.0))
+    for bias, first in ((late, late.cause), (on_time, "they do not settle")):
+        said = with_increments(Deflections(bet=bet, fused=replace(answer(), camera_time_bias=bias))).no_increments
+        assert said.code == "increments-not-converged"
+        assert str(said).startswith(first)
+    assert late.cause
 
 
 def test_the_figure_shows_what_is_determined():
