@@ -42,6 +42,7 @@ chapters 2 and 5.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -99,6 +100,17 @@ _WORST_SQUARE = (
 _BUILT_RAD = np.deg2rad(0.3)
 _BUILT = [0, 1, -3, -2, -1]  # saddle and light: more waves beside a lens that is fitted cost more than they explain
 _POSES = POSED.stop - POSED.start
+# turns tried where the camera as mounted sees no shell: about right, down and the line of sight; a fit reaches from one
+# to the next (10 deg are 3 sd of a mount by a drawing)
+_TURNS_RAD = np.deg2rad(
+    [
+        *([0.0, 0.0, roll] for roll in range(20, 360, 20)),
+        [20.0, 0.0, 0.0],
+        [-20.0, 0.0, 0.0],
+        [0.0, 20.0, 0.0],
+        [0.0, -20.0, 0.0],
+    ]
+)
 # deflection
 LEAST_FRAMES, MOST_FRAMES = 12, 150
 _LONGEST_HOLE_S = 0.11  # a quarter of a period at 2.3 Hz, over which the joint's moment is interpolated
@@ -168,7 +180,13 @@ def orient_camera(
         oriented, refused = _by_stated_features(nominal, frame, prior, apriori)
         if oriented is not None:
             return _with_marked(oriented, frame)
-    oriented = _oriented(nominal, frame, prior, apriori, valleys)
+    try:
+        oriented = _oriented(nominal, frame, prior, apriori, valleys)
+    except GateError as refused_as_mounted:
+        seen = _turn_seen(nominal, frame, prior, apriori)
+        if not seen:
+            raise
+        raise GateError(f"{refused_as_mounted}; {seen}", refused_as_mounted.codes[0]) from None
     if oriented.has_bad_benchmark:
         raise GateError(
             f"benchmark frame: {100.0 * oriented.support:.0f} % of the valleys between tori and "
@@ -254,6 +272,26 @@ def _oriented(
         assert trouble is not None
         raise trouble
     return oriented
+
+
+def _turn_seen(nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd) -> str:
+    """How the camera would have to be turned for the shell to be seen where it should be; empty where no turn fits."""
+    best: tuple[float, FloatArray] | None = None
+    for turn in _TURNS_RAD:
+        view = replace(nominal, camera=nominal.camera.turned(turn, 1.0))
+        with suppress(GateError):
+            found = _fitted(view, benchmark, prior, apriori, np.zeros(_POSES), _REACHES_PX, valleys)
+            score = found.support / max(found.residual_rms_px, 1e-3)
+            is_sound = found.support > USUAL_SHARE and found.residual_rms_px < USUAL_RMS_PX
+            if is_sound and found.edge_in_view > USUAL_SHARE and (best is None or score > best[0]):
+                best = score, turn + found.corrections[:3]
+    if best is None:
+        return ""
+    across, roll = np.rad2deg([np.hypot(*best[1][:2]), (best[1][2] + np.pi) % (2.0 * np.pi) - np.pi])
+    return (
+        f"the shell is where a camera would see it that is turned by about {abs(roll):.0f} deg about its line of sight "
+        f"and by {across:.0f} deg across it: check the mount's angles in the vehicle file before the time"
+    )
 
 
 def with_deflected_benchmark(oriented: OrientedCamera, theta_rad: float, plane_lv_rad: float) -> OrientedCamera:

@@ -66,3 +66,12 @@ def test_frames_that_do_not_show_it_go_with_their_neighbours():
     fits = [unseen, answered, unseen, answered, unseen, out, unseen, unseen]
     assert [bool(fit.refused) for fit in without_moved(fits)] == [False] * 4 + [True] * 4
     assert not any(fit.refused for fit in without_moved([unseen] * 3))
+
+
+def test_little_of_it_in_view_is_enough(frames, oriented):
+    """100 px of it, as a camera that sees no more than a corner."""
+    column = oriented.body.lines.origin_px[:, 0]
+    corner = (column > 520.0) & (column < 620.0)
+    assert oriented.body.moved_px(KeptPicture(frames[1]), corner) == 0.0
+    elsewhere = KeptPicture(moved(frames[1], (0.0, -6.0)))
+    assert oriented.body.moved_px(elsewhere, corner) == pytest.approx(6.0, abs=0.7)

@@ -1,6 +1,7 @@
 """Frames that show the shell, but not as the camera saw it: what is refused, by which code."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.checks import Fault, GateError
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 from tests.estimators.test_other_film import answers
+from tests.refusing import numbers_in
 
 CONTRADICTS = {"camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge"}
 THETA_DEG, PLANE_DEG = [0.0, 3.0, 3.6], [0.0, 188.0, 160.0]
@@ -170,7 +172,42 @@ def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
     assert codes(4) == []
     assert codes(4, 6) == [5]
     assert codes(7, 8) == [6, 9]
+    assert codes(4, 6, code="shell-little-seen") == [5]
     assert codes(4, 6, code="frame-dark") == []
+
+
+def test_part_of_an_edge_beside_hardly_a_feature_is_no_answer(frames):
+    """It passes for that of a shell degrees away, and features there for a few of its own."""
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    edge, features = int(oriented._benchmark_edge.sum()), int((~oriented._benchmark_edge).sum())
+
+    def seen(of_edge, of_features):
+        points = int(of_edge * edge)
+        rows = np.zeros(points + int(of_features * features))
+        last = SimpleNamespace(rows=rows, edge_count=points)
+        oriented._check_seen(SimpleNamespace(points_px=np.zeros(points)), last)
+
+    seen(0.6, 0.3)
+    seen(0.9, 0.1)
+    for of_edge, of_features in ((0.6, 0.1), (0.3, 0.3)):
+        with pytest.raises(GateError) as refusal:
+            seen(of_edge, of_features)
+        assert refusal.value.codes == ("shell-little-seen",)
+
+
+@pytest.mark.parametrize(("key", "off_deg"), [("roll_deg", 80.0), ("axis_from_forward_deg", -20.0)])
+def test_a_mount_stated_wrongly_is_named_where_the_shell_is_seen_by_a_turned_camera(frames, key, off_deg):
+    wrong = MOUNT.model_copy(update={key: getattr(MOUNT, key) + off_deg})
+    with pytest.raises(GateError) as refusal:
+        orient_camera(frames[0], GEOMETRY, wrong, JOINT_M)
+    assert refusal.value.codes == ("edge-not-clear",)
+    *_, about, across = numbers_in(str(refusal.value))
+    assert max(about, across) == pytest.approx(abs(off_deg), abs=12.0)
+    # nothing of the kind is said of a frame that shows no shell
+    noise = np.random.default_rng(3).integers(90, 130, frames[0].shape).astype(np.uint8)
+    with pytest.raises(GateError) as refusal:
+        orient_camera(noise, GEOMETRY, wrong, JOINT_M)
+    assert "turned" not in str(refusal.value)
 
 
 def test_a_benchmark_without_any_point_is_refused_in_words(frames):

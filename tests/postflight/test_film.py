@@ -8,6 +8,9 @@ import pytest
 
 from flightmodel.film import film_frames
 from flightmodel.flightfolder import read_flight
+from postflight.filming import camera_answer
+from postflight.flight import read_flight as read_flown
+from synthetic_flight.film import Imaging
 from tests.estimators.test_camera_deflection import film as rendered
 from tests.postflight.test_bad_input import names_line, refused
 from tests.refusing import numbers_in, printed_codes
@@ -158,6 +161,26 @@ def test_the_camera_alone_needs_no_radar(flight, command, sensors):
         done = command("deflection", flight.root, *others)
         assert done.returncode == 2
         assert printed_codes(done.stderr) == ["tracker-missing", *["inertial-missing"] * (not sensors)]
+
+
+@pytest.mark.parametrize(
+    ("painted", "plane_deg", "red"),
+    [
+        (True, 170.0, set()),
+        (True, 350.0, {"camera-plane"}),
+        (True, 80.0, {"camera-plane"}),
+        (False, None, {"camera-features"}),
+    ],
+)
+def test_a_film_that_contradicts_what_is_stated_turns_a_check_red(flight, painted, plane_deg, red):
+    """A plane across or opposite, and features that are not there; the same film as it was painted passes."""
+    for k, picture in enumerate(rendered(4, [0.0, 3.0, 3.0], [0.0, 170.0, 180.0], Imaging(painted=painted))):
+        cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), picture)
+    flown = read_flown(flight.root, needs_path=False).with_(camera_plane_lv_deg=plane_deg)
+    checks = {check.code: check for check in camera_answer(flown, None).consistency_checks}
+    assert {"camera-features"} | ({"camera-plane"} if plane_deg else set()) <= set(checks)
+    assert {code for code, check in checks.items() if not check.passed} == red
+    assert {check.source for check in checks.values() if not check.passed} <= {"camera"}
 
 
 def test_a_benchmark_frame_alone_is_no_answer(flight, command):
