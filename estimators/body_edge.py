@@ -5,8 +5,8 @@ the shell does; a turn, a zoom or a picture that was moved shifts it. Across its
 is sought from the body outwards, darker or brighter: the body is plain. Where the silhouette does not stand out, as
 before a shell in shadow, nothing is said.
 
-Assumed: the body's own shadow beside its edge, which may pass for the edge, leaves a part of the edge alone. In 451
-frames of 42 sound films a seventh of its points or more stay; of a camera that moved hardly any.
+Assumed: the body's own shadow beside its edge, which may pass for the edge, leaves a part of the edge alone. Of 707
+frames of 66 sound films one keeps less than a tenth of its points; of a camera that moved hardly any stay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, sample
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 
-_EVERY_PX = 2  # along the silhouette
+_EVERY_PX = 2  # along the silhouette, of which a camera may see no more than a corner
 _REACH_PX = 24.0  # of a camera of which an inch of height over the skin is not known
 _LEVEL = 12  # samples of the plain body
 _HALF = 4  # samples on either side of a step
