@@ -46,6 +46,7 @@ import numpy as np
 from flightmodel.checks import DivergenceError, FloatArray, IntArray
 from flightmodel.telemetry import Finding
 from recon import _glr_kernels
+from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Innovations, Problem
 from recon.imu_screening import TransientOffset
 
@@ -128,6 +129,17 @@ class UnmodelledAcceleration:
             "motion model explain; check for staging, thrust, a parachute or a saturated sensor"
         )
         return Finding("motion", remark, self.start_s, self.end_s, UNMODELLED_CODE)
+
+
+def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> ConsistencyCheck:
+    """Whether accelerometer and gyros carry the track without any acceleration that they did not measure."""
+    where = ", ".join(f"{d.start_s:.1f} to {d.end_s:.1f} s" for d in spans)
+    return consistency_check(
+        UNMODELLED_CODE, "sensors carry the track", len(spans), 0.0, 0.0, "accelerometer and gyros carry the track",
+        f"an acceleration that they did not measure is needed to follow the track ({where})",
+        advice="trackers that lag (time tags, a receiver beyond its dynamics), or sensors that saturate: correct or "
+        "exclude these (use_s), or state the span in [[motion.disturbed]]",
+    )  # fmt: skip
 
 
 def with_unmodelled(problem: Problem, spans: tuple[UnmodelledAcceleration, ...]) -> Problem:

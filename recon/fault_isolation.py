@@ -35,7 +35,7 @@ import pandas as pd
 
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding
+from flightmodel.telemetry import Finding, Telemetry
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
 from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, beyond_gate, edit_check
 from recon.ekf import Problem
@@ -114,6 +114,8 @@ class Adaptation:
         What the oscillation of the vehicle shows of accelerometer and gyros.
     rejected_points : dict
         By name of a tracker, times (k,) of its points that all the rest of the flight contradicts.
+    late_s : dict
+        By name of a tracker, by how much its tags are set back (`recon.tracker_time`).
     """
 
     inflated_sd: dict[str, float] = field(default_factory=dict)
@@ -122,6 +124,7 @@ class Adaptation:
     lag: Lag | None = None
     oscillation: Oscillation | None = None
     rejected_points: dict[str, FloatArray] = field(default_factory=dict)
+    late_s: dict[str, float] = field(default_factory=dict)
 
 
 NO_ADAPTATION = Adaptation()
@@ -317,6 +320,14 @@ def inflated_priors(checks: tuple[ConsistencyCheck, ...], table: pd.DataFrame) -
         far = mine[mine.estimate.abs() > check.high * shift_sd]
         out |= {str(name): INFLATION * abs(float(found)) for name, found in zip(far.name, far.estimate, strict=True)}
     return out
+
+
+def inflated_clocks(lag: Lag | None, telemetry: Telemetry) -> dict[str, float]:
+    """Standard deviations to take instead of those of the inertial clocks, where they differ by more than stated."""
+    if lag is None:
+        return {}
+    sensors = telemetry.accelerometer, telemetry.rates
+    return {f"{t.spec.name} time bias": INFLATION * abs(lag.lag_s) for t in sensors if t is not None}
 
 
 def with_inflated_priors(problem: Problem, inflated_sd: dict[str, float]) -> Problem:

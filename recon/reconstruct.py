@@ -55,6 +55,7 @@ from recon import (
     smoother,
     survey,
     time_bias,
+    tracker_time,
 )
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, held_out_table
@@ -64,6 +65,7 @@ from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UNMODELLED_CODE,
     UnmodelledAcceleration,
+    carried_check,
     unsupported_offsets,
     with_unmodelled,
 )
@@ -188,19 +190,25 @@ def reconstruct(
         report(0.5, "trying single faults")
         faults = _single_faults(telemetry, settings, solution)
         telemetry, solution = _with_corrected_clock(telemetry, settings, solution, faults)
+    if late_s := tracker_time.lags(telemetry, faults, solution.sensor_errors):
+        solution = _with_tags_set_back(telemetry, settings, replace(known, late_s=late_s), solution)
     inflated = known.inflated_sd | fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
-    inflated |= _inflated_clocks(telemetry, solution)
+    inflated |= fault_isolation.inflated_clocks(solution.adaptation.lag, telemetry)
     if inflated != known.inflated_sd:
         solution = _with_inflated_priors(telemetry, settings, solution, inflated)
     sources = trackers(telemetry, settings)
     if len(sources) > 1 and fault_isolation.any_tracker_fails(solution.consistency_checks, sources):
         solution = _compared_leaving_one_out(telemetry, settings, solution, sources, report)
         solution = _with_shared_errors_tried(telemetry, settings, solution)
+    times, lags, table = tracker_time.judged_by_the_stated(
+        telemetry, solution.adaptation.late_s, solution.sensor_errors, settings.check_confidence
+    )
     report(1.0, "done")
     return replace(
         solution,
-        consistency_checks=(*solution.consistency_checks, *at_rest),
-        findings=(*solution.findings, *rest.noise_findings(telemetry), *survey.unchecked_state(telemetry)),
+        sensor_errors=table,
+        consistency_checks=(*solution.consistency_checks, *at_rest, *times),
+        findings=(*solution.findings, *lags, *rest.noise_findings(telemetry), *survey.unchecked_state(telemetry)),
         single_faults=faults,
     )
 
@@ -208,14 +216,22 @@ def reconstruct(
 def _single_faults(telemetry: Telemetry, settings: Settings, solution: TrajectorySolution) -> tuple[SingleFault, ...]:
     """Single hypotheses, likeliest first: of the two triads alone, where their oscillation contradicts itself."""
     known, swings = solution.adaptation, solution.adaptation.oscillation
-    candidates = single_faults.corrections(telemetry, swings, known.lag)
-    if not candidates:
+    candidates = by_oscillation = single_faults.corrections(telemetry, swings, known.lag)
+    if not by_oscillation:
         prior_sd = dict(zip(solution.sensor_errors.name, solution.sensor_errors.prior_sd, strict=True))
         candidates = single_faults.singles(telemetry, trackers(telemetry, settings), prior_sd)
     coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, 1.0), pulse_rate_hz=0.0)
     try:
         as_stated = _coarse_problem(telemetry, coarse, known)
-        stated, _ = _log_likelihood(Single("", "", (), telemetry), as_stated, coarse)
+
+        def filtered(one: Single) -> tuple[Problem, ekf.ForwardPass, States]:
+            # most hypotheses are of the data as delivered, whose screening and integration take the time
+            problem = as_stated if one.telemetry is telemetry else _coarse_problem(one.telemetry, coarse, known)
+            problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
+            thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(linearisation.THINNED_STEP_S)
+            return linearisation.converged(thinned, coarse.engine)
+
+        stated, _ = single_faults.log_likelihood(*filtered(Single("", "", (), telemetry))[:2])
     except GateError:
         return ()
     found: list[SingleFault] = []
@@ -223,12 +239,12 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
         return ()
     for one in candidates:
         try:
-            # most hypotheses are of the data as delivered, whose screening and integration take the time
-            problem = as_stated if one.telemetry is telemetry else _coarse_problem(one.telemetry, coarse, known)
-            likelihood, misfit = _log_likelihood(one, problem, coarse)
+            likelihood, misfit = single_faults.log_likelihood(*filtered(one)[:2])
         except GateError:
             continue
         found.append(SingleFault(one.code, one.words, one.sources, likelihood - stated, misfit))
+    if not by_oscillation:
+        found += tracker_time.late_trackers(telemetry, settings.without, filtered)
     # what the oscillation has shown needs no other proof: the trackers only say which of the two it is
     shown = known.lag is not None or (bool(found) and found[0].code == "triads-axes")
     return single_faults.ranked(found, shown)
@@ -237,14 +253,6 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
 def _coarse_problem(telemetry: Telemetry, coarse: Settings, known: Adaptation) -> Problem:
     sensors = bridge_inertial_sensors(telemetry, replace(known, rejected_offsets=()))
     return build_problem(telemetry, coarse, sensors, known.rejected_points)
-
-
-def _log_likelihood(one: Single, problem: Problem, coarse: Settings) -> tuple[float, float]:
-    """Log likelihood of thinned tracking data of a problem under a hypothesis, and the innovations' mean square."""
-    problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
-    thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(linearisation.THINNED_STEP_S)
-    thinned, run, _ = linearisation.converged(thinned, coarse.engine)
-    return single_faults.log_likelihood(thinned, run)
 
 
 def _with_corrected_clock(
@@ -268,6 +276,17 @@ def _with_corrected_clock(
     return one.telemetry, replace(again, consistency_checks=checks, findings=(*again.findings, finding))
 
 
+def _with_tags_set_back(
+    telemetry: Telemetry, settings: Settings, known: Adaptation, first: TrajectorySolution
+) -> TrajectorySolution:
+    """Solution with tags of trackers set back; the first where that one fails a check and the first fails some too."""
+    try:
+        again = reconstruct_once(telemetry, settings, adaptation=known)
+    except GateError:
+        return first
+    return again if any(all(v.passed for v in one.consistency_checks) for one in (again, first)) else first
+
+
 def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[ConsistencyCheck]:
     """Checks of the inertial sensors on the pad; none without a rest, or a place."""
     points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
@@ -285,14 +304,6 @@ def _with_inflated_priors(
         *fault_isolation.prior_inflation_findings(again.sensor_errors, inflated_sd, *span),
     )
     return replace(again, consistency_checks=first.consistency_checks, residuals=first.residuals, findings=findings)
-
-
-def _inflated_clocks(telemetry: Telemetry, solution: TrajectorySolution) -> dict[str, float]:
-    """Standard deviations to take instead of those of the inertial clocks, where they differ by more than stated."""
-    lag, sensors = solution.adaptation.lag, (telemetry.accelerometer, telemetry.rates)
-    if lag is None:
-        return {}
-    return {f"{t.spec.name} time bias": INFLATION * abs(lag.lag_s) for t in sensors if t is not None}
 
 
 def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
@@ -386,6 +397,7 @@ def reconstruct_once(
     checks += deceleration_checks(telemetry, problem, run, settings.check_confidence)
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += [] if phase is None else [phase.check()]
+    checks += [] if sensors is None else [carried_check(spans)]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
     held_out = held_out_table(problem, run, settings.engine)
     checks += consistency.held_out_checks(problem, held_out, settings)
@@ -446,6 +458,7 @@ def _provenance(telemetry: Telemetry, settings: Settings, problem: Problem, pass
 def _adapted_problem(
     telemetry: Telemetry, settings: Settings, sensors: InertialSensors | None, adaptation: Adaptation
 ) -> Problem:
+    telemetry = tracker_time.with_earlier_tags(telemetry, adaptation.late_s)
     problem = build_problem(telemetry, settings, sensors, adaptation.rejected_points)
     problem = fault_isolation.with_inflated_priors(problem, adaptation.inflated_sd)
     if sensors is None:

@@ -74,13 +74,17 @@ class Single:
 
 @dataclass(frozen=True)
 class SingleFault:
-    """A hypothesis with its log likelihood over that of the flight as stated, and the innovations' mean square."""
+    """A hypothesis with its log likelihood over that of the flight as stated, and the innovations' mean square.
+
+    ``late_s`` is by how much it sets tags of trackers back.
+    """
 
     code: str
     words: str
     sources: tuple[str, ...]
     gain: float
     misfit: float = 1.0
+    late_s: float = 0.0
 
 
 def log_likelihood(problem: Problem, run: ForwardPass) -> tuple[float, float]:
@@ -168,7 +172,9 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
         own = {k: WIDER * sd for k, sd in prior_sd.items() if k.startswith(f"{name} ") and sd > 0.0}
         late = {k: sd for k, sd in own.items() if k == f"{name} time bias"}
         rest = {k: sd for k, sd in own.items() if k not in late}
-        if late:
+        if late and (
+            telemetry.motion.model == "ballistic" or name in telemetry.barometers
+        ):  # else `recon.tracker_time`
             out.append(Single("time-bias", f"{name}: time bias", (name,), telemetry, late))
         if rest:
             out.append(Single("tracker", f"{name}: site or calibration", (name,), telemetry, rest))

@@ -174,12 +174,12 @@ def test_the_source_of_a_single_fault_is_named_first(mini_sense, spoil, code, so
     assert first.sources[0] == source
 
 
-def test_a_tracker_whose_points_are_all_rejected_is_red_and_named(mini_sense):
+def test_a_tracker_of_which_every_point_was_rejected_is_set_right_red_and_named(mini_sense):
     telemetry, _ = mini_sense(46)
     record = telemetry.radars["west"]
     late = replace(telemetry, radars=telemetry.radars | {"west": replace(record, time_s=record.time_s + 1.0)})
     solution = reconstruct(late, FAST)
-    assert [v.passed for v in solution.consistency_checks if (v.code, v.source) == ("edited", "west")] == [False]
+    assert [(v.code, v.source) for v in solution.consistency_checks if not v.passed] == [("tracker-time", "west")]
     first = isolate_faults(solution.consistency_checks, solution.left_out, solution.single_faults)[0]
     assert first.sources == ("west",)
 

@@ -10,6 +10,7 @@ from recon.fault_detection import (
     LEAST_REJECTED_POINTS,
     MOST_SPANS,
     UnmodelledAcceleration,
+    carried_check,
     with_one_more,
 )
 
@@ -45,3 +46,10 @@ def test_few_spans_and_any_number_in_ballistic_flight_are_followed():
     known = tuple(UnmodelledAcceleration(30.0 * k, 30.0 * k + 2.0, 0.1) for k in range(MOST_SPANS - 1))
     assert len(with_one_more(known, *lost_from(295.0 - LEAST_REJECTED_POINTS, ballistic=False))) == MOST_SPANS
     assert len(follow(ballistic=True)) > MOST_SPANS
+
+
+def test_inertial_sensors_that_need_a_span_do_not_carry_the_track():
+    assert carried_check(()).passed
+    check = carried_check((UnmodelledAcceleration(30.0, 32.0, 0.1),))
+    assert (check.code, check.passed) == ("unmodelled-acceleration", False)
+    assert "30.0 to 32.0 s" in check.remark
