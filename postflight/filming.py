@@ -102,8 +102,8 @@ class CameraAnswer:
             words = f"{camera}: the benchmark frame shows the features that the vehicle file states"
             if why:
                 words = (
-                    f"{camera}: {why}; the answers go by edge and texture, and more of the vehicle file may be wrong: "
-                    'check its outline, mount and lens, or state features = "texture"'
+                    f"{camera}: {why}; the answers go by edge and texture, and more may be wrong: check outline, mount "
+                    'and lens of the vehicle file and that the frame is one at rest, or state features = "texture"'
                 )
             source, name = "camera" if self.joined is None else camera, f"{camera}: stated features not found"
             checks.append(ConsistencyCheck("camera-features", name, float(bool(why)), 0.0, 0.0, not why, words, source))

@@ -31,8 +31,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
-from postflight.checks.track_clocks import bias_of, is_sharp
-from postflight.checks.track_force import best_comparison, track_force
+from postflight.checks.track_force import best_comparison, bias_of, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.intake.flight_form import placeholders
 from postflight.streams import write_out
@@ -294,7 +293,7 @@ def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report:
 
 def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
     """Add a time bias to the report where its standard deviation is small enough; None where it is not."""
-    if bias is None or not is_sharp(bias):
+    if bias is None or not bias.is_sharp:
         return None
     report.time_biases.append(bias)
     return bias

@@ -11,22 +11,9 @@ from itertools import combinations
 
 from flightmodel.telemetry import Telemetry
 from postflight.checks import inertial, tracks
-from postflight.checks.track_force import Comparison, best_comparison
-from postflight.checks.units_and_axes import TimeBias, clock_remarks
+from postflight.checks.track_force import best_comparison, bias_of
+from postflight.checks.units_and_axes import clock_remarks
 from recon.fault_isolation import TRIADS, FaultHypothesis
-
-SHARP_S = 0.5  # a time bias of a larger standard deviation says nothing of a clock
-FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe a comparison
-
-
-def is_sharp(bias: TimeBias | None) -> bool:
-    """Whether a time bias is known well enough to be shown."""
-    return bias is not None and bias.sd_s < SHARP_S
-
-
-def bias_of(name: str, seen: Comparison | None) -> TimeBias | None:
-    """Time bias of a track against the accelerometer; None where the comparison describes none, or badly."""
-    return TimeBias(name, TRIADS[0], seen.lag_s, seen.lag_sd_s) if seen is not None and seen.misfit < FITS else None
 
 
 def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[FaultHypothesis, ...]:
@@ -50,7 +37,7 @@ def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[F
         biases.append(bias_of(name, seen))
     triads = {name: t for name, t in zip(TRIADS, (sensed, telemetry.rates), strict=True) if t is not None}
     biases.append(inertial.oscillation_of(triads, telemetry.vehicle).bias)
-    known = [bias for bias in biases if bias is not None and is_sharp(bias)]
+    known = [bias for bias in biases if bias is not None and bias.is_sharp]
     involved = tuple(dict.fromkeys(name for bias in known for name in (bias.source, bias.against)))
     out = []
     for remark in clock_remarks(known, tuple(triads)):

@@ -18,7 +18,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray
-from postflight.checks.units_and_axes import interval_around
+from postflight.checks.units_and_axes import TimeBias, interval_around
 
 _LEAST_SAMPLES = 6  # of a window
 _LEAST_WINDOWS = 8  # for a scale and a lag, with their scatter
@@ -28,6 +28,7 @@ _LARGEST_LAG_S = 5.0  # of a clock set by hand; hours and leap seconds are looke
 _LAG_STEPS = 401  # 25 ms, between which a parabola finds the least
 _LEAST_MISFIT = 0.25  # a window's scatter holds what a quadratic leaves out, and is too large by as much
 _OVERLAP = np.sqrt(1.5)  # neighbouring windows share half of their samples
+_FITS = 5.0  # reduced chi-square beyond which one lag and one scale do not describe a comparison
 _WIDTHS_S = (1.0, 2.0, 4.0, 8.0, 16.0)  # of windows, from a precise receiver's to a coarse radar's
 
 
@@ -220,3 +221,10 @@ def _compare(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray) -> 
         lag = float(lags[k] + 0.5 * step * (low - high) / (low - 2 * mid + high))
         lag_sd = float(np.sqrt(2.0 / curvature) * inflation * _OVERLAP)
     return Comparison(lag, lag_sd, float(scale[k]), float(scale_sd), misfit, float(late[0]), float(late[-1]))
+
+
+def bias_of(name: str, seen: Comparison | None) -> TimeBias | None:
+    """Time bias of a track against the accelerometer; None where the comparison describes none, or badly."""
+    return (
+        TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s) if seen is not None and seen.misfit < _FITS else None
+    )

@@ -23,6 +23,7 @@ AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
 _SAME_UNIT = 0.05  # logarithm: a unit explains a ratio within this
 _SIGNIFICANT_SD, _SIGNIFICANT_S = 5.0, 0.1  # beyond both: a tenth of a second, which the filter's own time bias takes
 _WORTH_A_LOOK_SD = 3.0  # a remark, not a warning: one in 370 by chance
+_SHARP_S = 0.5  # a time bias of a larger standard deviation says nothing of a clock
 
 
 def unit_of(source: Source, quantity: Quantity) -> str:
@@ -87,6 +88,11 @@ class TimeBias:
     def is_significant(self) -> bool:
         """Whether it is beyond five standard deviations and 0.1 s."""
         return abs(self.late_s) > max(_SIGNIFICANT_SD * self.sd_s, _SIGNIFICANT_S)
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether it is known well enough to be shown."""
+        return self.sd_s < _SHARP_S
 
     @property
     def is_worth_a_look(self) -> bool:
