@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
+from estimators.agreement import Agreement
 from estimators.camera import sensitivity_table
 from estimators.misalignment import estimate_misalignment as misalignment_history
 from estimators.trim import estimate_trim as trim_history
@@ -110,6 +111,7 @@ class Deflections(Tabular):
         of_cameras = () if self.camera is None else self.camera.consistency_checks
         if self.fused is not None:
             of_table = () if self.increments is None else self.increments.consistency_checks
+            of_cameras = tuple(borne_out(check, self.fused.agreement) for check in of_cameras)
             return (*of_cameras, *self.fused.consistency_checks, *of_table)
         reason = self.refused.get("fused")
         if reason is None or reason.code not in NO_COMMON_ANSWER:
@@ -162,6 +164,15 @@ class Deflections(Tabular):
             shown.append(f"{method} {known}")
         answers = f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
         return f"{self.doubt}; {answers}" if self.doubt else answers
+
+
+def borne_out(check: ConsistencyCheck, agreement: Agreement) -> ConsistencyCheck:
+    """Check of a camera: features that its film lacks are no fault where the inertial methods agree with its answer."""
+    compared = [pair for pair in agreement.pairs if "camera" in pair.methods]
+    if check.passed or check.code != "camera-features" or not compared or agreement.hypotheses:
+        return check
+    words = f"{check.remark} (the inertial methods agree with the camera)"
+    return replace(check, high=check.value, passed=True, remark=words)
 
 
 def no_answer_at(history: DeflectionHistory, at_s: float) -> Fault:

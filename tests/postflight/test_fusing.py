@@ -11,8 +11,9 @@ from estimators.fusion import fuse
 from flightmodel.checks import DivergenceError, Fault
 from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
 from postflight import fusing
-from postflight.deflections import Deflections, quantiles_at
+from postflight.deflections import Deflections, borne_out, quantiles_at
 from postflight.fusing import _mixed, fuse_flight
+from recon.consistency import ConsistencyCheck
 from tests.estimators.conftest import VEHICLE, pulse_of
 
 N = 160
@@ -180,6 +181,16 @@ def test_a_refused_fusion_is_a_red_check():
     # one that has nothing to say is none
     assert Deflections(refused={"fused": Fault("no vehicle", "vehicle-missing")}).consistency_checks == ()
     assert Deflections().consistency_checks == ()
+
+
+def test_features_that_a_film_lacks_are_no_fault_where_the_inertial_methods_bear_it_out():
+    lacking = ConsistencyCheck("camera-features", "stated features", 1.0, 0.0, 0.0, False, "not found", "camera")
+    assert borne_out(lacking, fuse_flight(sound(), film(motion())).agreement).passed
+    assert not borne_out(lacking, fuse_flight(sound(), None).agreement).passed
+    for spoilt in SPOILT.values():
+        assert not borne_out(lacking, fuse_flight(sound(), spoilt).agreement).passed
+    moved = replace(lacking, code="camera-rest")
+    assert not borne_out(moved, fuse_flight(sound(), film(motion())).agreement).passed
 
 
 def test_two_methods_that_contradict_are_spanned_by_the_mixture_of_each_alone():
