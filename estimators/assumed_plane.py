@@ -86,6 +86,4 @@ def plane_test(film: FilmFit) -> PlaneTest | None:
     left_out = len(rows) // _MISREAD
     over_sd = max(float(np.sort(apart)[::-1][left_out]), float(np.sort(-inside / own_sd)[left_out]), 0.0)
     mean = np.mean(size[:, None] * np.column_stack([-np.cos(clock), np.sin(clock)]), axis=0)
-    return PlaneTest(
-        float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd
-    )  # fmt: skip
+    return PlaneTest(float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd)

@@ -172,9 +172,8 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
         own = {k: WIDER * sd for k, sd in prior_sd.items() if k.startswith(f"{name} ") and sd > 0.0}
         late = {k: sd for k, sd in own.items() if k == f"{name} time bias"}
         rest = {k: sd for k, sd in own.items() if k not in late}
-        if late and (
-            telemetry.motion.model == "ballistic" or name in telemetry.barometers
-        ):  # else `recon.tracker_time`
+        # beside inertial sensors `recon.tracker_time` tries the tags of radars and receivers
+        if late and (telemetry.motion.model == "ballistic" or name in telemetry.barometers):
             out.append(Single("time-bias", f"{name}: time bias", (name,), telemetry, late))
         if rest:
             out.append(Single("tracker", f"{name}: site or calibration", (name,), telemetry, rest))

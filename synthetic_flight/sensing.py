@@ -194,10 +194,10 @@ def sense_gnss(
     GateError
         Where fewer than two fixes are left.
     """
-    at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
-    size = {key: values[0] for key, values in GNSS.from_scenario(spec).items()}
     from scipy.interpolate import CubicHermiteSpline  # a fifth of a second, for commands that do not simulate
 
+    at = sample_times(start_s, truth.time_s[-1] - 0.05, spec.rate_hz, spec.offset_s)
+    size = {key: values[0] for key, values in GNSS.from_scenario(spec).items()}
     late = size["time_bias_sd_s"] * rng.standard_normal()
     seen_at = np.clip(at - late, truth.time_s[0], truth.time_s[-1])
     path, arm = truth.trajectory, np.array(spec.antenna_from_datum_body_m)

@@ -53,7 +53,6 @@ _TRAJECTORY: list[tuple[str, str, str, float, int, list[tuple[str, str, str | No
         ("y, corrected", "ay_imu_mps2", "ay_imu_sd_mps2", AXES["y"], []),
         ("z, corrected", "az_imu_mps2", "az_imu_sd_mps2", AXES["z"], [6, 3])]),
 ]  # fmt: skip
-_FORCES = ("axial", "lateral")  # panels of the accelerometer
 _FLOOR = {"speed", "mach", "pressure", "alpha", "deflection"}
 
 
@@ -89,7 +88,7 @@ def trajectory_panels(run: Run, rows: Rows) -> tuple[list[Panel], list[tuple[str
     bet = run.tables["bet"].iloc[rows]
     raw = {"altitude": _tracker_heights(run)} | _raw_accelerations(run)
     no_force = _NO_ACCELEROMETER if run.telemetry.accelerometer is None else _NO_GYROS
-    why_absent = {"alpha": _NO_ATTITUDE} | dict.fromkeys(_FORCES, no_force)
+    why_absent = {"alpha": _NO_ATTITUDE, "axial": no_force, "lateral": no_force}
     panels, absent = [], []
     for name, title, unit, scale, decimals, drawn in _TRAJECTORY:
         lines = []
