@@ -102,7 +102,7 @@ class Flight(Tabular):
             Without the attitude that flight.toml states.
         camera_plane_lv_deg : float or None
             Assumed plane of the camera's deflection; None to estimate it.
-        **settings
+        **settings : object
             Any field of `Settings` (``without=("radar_a",)``, ``engine="filterpy"``, ``output_rate_hz=50.0``).
 
         Raises
