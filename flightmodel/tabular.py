@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
-SHOWN_ROWS = 12
+SHOWN_ROWS, SHOWN_COLUMNS = 12, 20
 
 
 class Tabular:
@@ -32,5 +32,8 @@ class Tabular:
         """Return a table for a notebook, with the line as its caption."""
         from html import escape
 
-        table = self.to_frame().to_html(max_rows=SHOWN_ROWS, index=False, border=0, float_format=lambda x: f"{x:.6g}")
-        return f"<p><b>{type(self).__name__}</b>: {escape(self._about())}</p>{table}"
+        table = self.to_frame().to_html(
+            max_rows=SHOWN_ROWS, max_cols=SHOWN_COLUMNS, index=False, border=0, float_format=lambda x: f"{x:.6g}"
+        )
+        caption = f"<p><b>{type(self).__name__}</b>: {escape(self._about())}</p>"
+        return f'{caption}<div style="overflow-x: auto">{table}</div>'
