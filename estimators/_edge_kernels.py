@@ -1,5 +1,5 @@
-"""Compiled search for the shell's edge and for dark features on it; the models are in `estimators.edge` and
-`estimators.features`; readable twin: ``tests/oracles/plain_horizon.py``.
+"""Compiled search for the edges of shell and centerbody and for dark features; the models are in `estimators.edge`,
+`estimators.body_edge` and `estimators.features`; readable twin: ``tests/oracles/plain_horizon.py``.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ def _grey_at(image, u, v):
 
 
 @inlined
-def median(values, count):
-    """Median of the first values, whose order changes (selection by C. A. R. Hoare)."""
-    half = count // 2
+def _select(values, count, rank):
+    """Move the value of a rank to its place among the first values, smaller ones before it (C. A. R. Hoare)."""
     low, high = 0, count - 1
     while low < high:
-        pivot, i, j = values[half], low, high
+        pivot, i, j = values[rank], low, high
         while i <= j:
             while values[i] < pivot:
                 i += 1
@@ -46,16 +45,66 @@ def median(values, count):
                 values[i], values[j] = values[j], values[i]
                 i += 1
                 j -= 1
-        if j < half:
+        if j < rank:
             low = i
-        if half < i:
+        if rank < i:
             high = j
+
+
+@inlined
+def median(values, count):
+    """Median of the first values, whose order changes."""
+    half = count // 2
+    _select(values, count, half)
     if count % 2:
         return values[half]
     below = values[0]
     for i in range(1, half):
         below = max(below, values[i])
     return 0.5 * (below + values[half])
+
+
+@kernel
+def middle_of_sizes(values, bins):
+    """Median of the sizes of numbers (n, m) without NaN, by a count in ``bins`` and a selection in the middle's own.
+
+    Of a selection alone the processor guesses half of the comparisons wrongly.
+    """
+    n, m = values.shape
+    most = 0.0
+    for i in range(n):
+        for j in range(m):
+            most = max(most, abs(values[i, j]))
+    if most == 0.0:
+        return 0.0
+    count, per = np.zeros(bins, dtype=np.int64), (bins - 1) / most
+    for i in range(n):
+        for j in range(m):
+            count[int(abs(values[i, j]) * per)] += 1
+    # both middle ones of an even number
+    second, below = n * m // 2, 0
+    first = second - 1 + n * m % 2
+    low = 0
+    while below + count[low] <= first:
+        below += count[low]
+        low += 1
+    high, upto = low, below + count[low]
+    while upto <= second:
+        high += 1
+        upto += count[high]
+    few, held = np.empty(upto - below), 0
+    for i in range(n):
+        for j in range(m):
+            size = abs(values[i, j])
+            if low <= int(size * per) <= high:
+                few[held] = size
+                held += 1
+    _select(few, held, second - below)
+    upper = few[second - below]
+    lower = upper if first == second else few[0]
+    for i in range(1, second - below if first < second else 0):
+        lower = max(lower, few[i])
+    return 0.5 * (lower + upper)
 
 
 @kernel
@@ -369,6 +418,92 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
             squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
             sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
         offset[i] = centre
+
+
+@inlined
+def _scatter(grey, begin, plain, last):
+    """Standard deviation of ``plain`` samples from the first; the last one counts for those behind it."""
+    mean, square = 0.0, 0.0
+    for j in range(plain):
+        mean += grey[min(begin + j, last - 1)]
+    mean /= plain
+    for j in range(plain):
+        square += (grey[min(begin + j, last - 1)] - mean) ** 2
+    return math.sqrt(square / plain)
+
+
+@inlined
+def _slope(grey, j, count):
+    """Size of the slope at a sample, of both neighbours where it has them."""
+    low, high = max(j - 1, 0), min(j + 1, count - 1)
+    return abs(grey[high] - grey[low]) / (high - low)
+
+
+@inlined
+def _steepest(grey, inside, hit, half, count, steps):
+    """Place of the steepest slope of the largest step near the first one, by a parabola through three slopes."""
+    most = hit
+    for j in range(hit, min(hit + 2 * half, count - half - 1) + 1):
+        steps[j - hit] = abs(grey[j + half] - grey[j - half]) if inside[j] else 0.0
+        if steps[j - hit] > steps[most - hit]:
+            most = j
+    at = max(most - half, 0)
+    for j in range(at, min(most + half, count - 1) + 1):
+        if _slope(grey, j, count) > _slope(grey, at, count):
+            at = j
+    at = min(max(at, 1), count - 2)
+    before, here, after = _slope(grey, at - 1, count), _slope(grey, at, count), _slope(grey, at + 1, count)
+    bend = min(before - 2.0 * here + after, -1e-9)
+    return at + min(max(0.5 * (before - after) / bend, -1.0), 1.0)
+
+
+@kernel
+def first_lasting_steps(image, origin, outward, first, step, corner, size, limits, place):
+    """Sample (n,) at which the first step from a plain beginning is steepest, on lines as of `sample_lines`; else NaN.
+
+    ``limits``: samples of a line, of its plain beginning, on either side of a step; least step, and least over the
+    beginning's scatter. A line is sampled no farther than its step.
+    """
+    count, plain, half, least, of_scatter = limits
+    grey, inside, steps = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(2 * half + 1)
+    for i in range(len(origin)):
+        place[i] = np.nan
+        begin, held, needed, hit, enough = -1, 0, count, -1, 0.0
+        k = 0
+        while k < needed:
+            along = first + k * step
+            u, v = origin[i, 0] + along * outward[i, 0], origin[i, 1] + along * outward[i, 1]
+            inside[k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
+            grey[k] = _grey_at(image, u - corner[0], v - corner[1])
+            if begin < 0 and inside[k]:
+                begin = k
+            if begin >= 0 and k == min(begin + plain, count) - 1:
+                held = k + 1
+                enough = max(least, of_scatter * max(_scatter(grey, begin, plain, held), 1.0))
+            # once the beginning is known, every sample so far may be the end of a step
+            start = begin + half if k == held - 1 else k - half
+            if held > 0 and hit < 0:
+                for j in range(max(start, begin + half, half), k - half + 1):
+                    if hit < 0 and inside[j] and abs(grey[j + half] - grey[j - half]) > enough:
+                        hit = j
+                        needed = min(hit + 4 * half + 2, count)
+            k += 1
+        if hit >= 0:
+            place[i] = _steepest(grey, inside, hit, half, count, steps)
+
+
+@kernel
+def coherent(line, residual, beside, within, found):
+    """Mark residuals (n,) that more than ``beside`` of as many places on either side, and their own, lie ``within``.
+
+    ``line`` (n,): places, increasing.
+    """
+    n = len(line)
+    for i in range(n):
+        alike = 0
+        for j in range(max(i - beside, 0), min(i + beside + 1, n)):
+            alike += abs(line[j] - line[i]) <= beside and abs(residual[j] - residual[i]) < within
+        found[i] = alike > beside
 
 
 @kernel

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, sampled
+from estimators import _edge_kernels
+from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, smoothed_about
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -94,24 +95,13 @@ def _lines(view: VirtualCamera) -> ScanLines | None:
 
 def _places(picture: KeptPicture, lines: ScanLines) -> FloatArray:
     """Where the edge lies on each line (n,), px from its origin; NaN where there is none, or none beside it."""
-    count = int(2.0 * _REACH_PX / STEP_PX) + 1
-    grey, inside = sampled(picture, lines, count)
-    rows, samples = np.arange(len(grey)), np.arange(count)
-    first = np.argmax(inside, axis=1)
-    level = np.minimum(first[:, None] + np.arange(_LEVEL), count - 1)
-    scatter = np.maximum(np.take_along_axis(grey, level, axis=1).std(axis=1), 1.0)
-    step = np.zeros_like(grey)
-    step[:, _HALF:-_HALF] = np.abs(grey[:, 2 * _HALF :] - grey[:, : -2 * _HALF])
-    step[~inside | (samples < first[:, None] + _HALF)] = 0.0
-    beyond = step > np.maximum(_LEAST_STEP, _OF_SCATTER * scatter)[:, None]
-    hit = np.argmax(beyond, axis=1)
-    near = (samples >= hit[:, None]) & (samples <= hit[:, None] + 2 * _HALF)
-    most = np.argmax(np.where(near, step, -1.0), axis=1)
-    slope = np.abs(np.gradient(grey, axis=1))
-    at = np.argmax(np.where(np.abs(samples - most[:, None]) <= _HALF, slope, -1.0), axis=1).clip(1, count - 2)
-    before, here, after = (slope[rows, at + k] for k in (-1, 0, 1))
-    bend = np.minimum(before - 2.0 * here + after, -1e-9)
-    place = STEP_PX * (at + np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) - _REACH_PX
-    place[~beyond.any(axis=1)] = np.nan
+    count = round(2.0 * _REACH_PX / STEP_PX) + 1
+    limits = (count, _LEVEL, _HALF, _LEAST_STEP, _OF_SCATTER)
+    at = np.empty(len(lines.index))
+    smooth, corner, size = smoothed_about(picture, lines)
+    _edge_kernels.first_lasting_steps(
+        smooth, lines.origin_px, lines.inward_px, -_REACH_PX, STEP_PX, corner, size, limits, at
+    )  # fmt: skip
+    place = STEP_PX * at - _REACH_PX
     place[~is_coherent(lines.index, _SMOOTHER * place)] = np.nan
-    return np.asarray(place, dtype=float)
+    return place

@@ -59,6 +59,7 @@ _SD_FLOOR_PX = 0.05  # assumed: cloth and lens are modelled no better
 # points of scenes with and without the Earth behind the rim, the same within a quarter for errors of 0.06 to 1.5 px
 _NOISE_TOGETHER = 2.0 * float(np.sqrt(np.pi)) * _SMOOTHING_PX / STEP_PX
 _MODEL_TOGETHER = 70.0
+_BINS = 4096  # of steps along lines; a hundred of 12,000 share the middle one
 _NEIGHBOURS, _COHERENT_PX = 4, 0.7  # on either side; an edge's own scatter is a few tenths of a pixel
 # rows of two moments: blocks as tall as an edge's blur a few times over and 8 samples wide; of noise alone the ratio of
 # the two differences scatters by a twelfth about one
@@ -271,7 +272,8 @@ def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
     near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
     grey, inside = sampled(image, near, len(NEAR_ALONG))
     # the noise, from samples so far apart that smoothing did not correlate them
-    noise = max(middle_of(np.abs(grey[:, 6] - grey[:, 0])) / (0.6745 * np.sqrt(2.0)), 0.3)
+    spread = _edge_kernels.middle_of_sizes(grey[:, 6:7] - grey[:, :1], _BINS)
+    noise = max(spread / (0.6745 * np.sqrt(2.0)), 0.3)
     place, along, left, good = np.zeros(n), np.zeros(n), np.zeros_like(grey), np.zeros(n, dtype=np.bool_)
     _edge_kernels.steps_near(
         grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, along, left, good
@@ -294,24 +296,9 @@ def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
     residual_px : (n,) float
         Against any smooth curve near the edge; NaN is not coherent.
     """
-    if not len(line):
-        return np.zeros(0, dtype=np.bool_)
-    # by place, with room for neighbours on both sides
-    places = np.full(int(line[-1]) + 1 + 2 * _NEIGHBOURS, np.nan)
-    places[line + _NEIGHBOURS] = residual_px
-    beside = np.lib.stride_tricks.sliding_window_view(places, 2 * _NEIGHBOURS + 1)[line]
-    with np.errstate(invalid="ignore"):
-        alike = np.abs(beside - residual_px[:, None]) < _COHERENT_PX
-    # half of those there may be, and the point itself
-    return np.asarray(alike.sum(axis=1) > _NEIGHBOURS)
-
-
-def middle_of(values: FloatArray) -> float:
-    """Median of numbers without NaN, in an eighth of the time of numpy's, which places three of them."""
-    flat = values.ravel()
-    half = len(flat) // 2
-    sorted_in = np.partition(flat, half)
-    return float(sorted_in[half] if len(flat) % 2 else 0.5 * (sorted_in[:half].max() + sorted_in[half]))
+    found = np.empty(len(line), dtype=np.bool_)
+    _edge_kernels.coherent(line, residual_px, _NEIGHBOURS, _COHERENT_PX, found)
+    return found
 
 
 class KeptPicture:
@@ -356,7 +343,17 @@ def kept_picture(image: Image | KeptPicture) -> KeptPicture:
 
 def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
     """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
-    picture = kept_picture(image)
+    smooth, corner, size = smoothed_about(kept_picture(image), lines)
+    n = len(lines.origin_px)
+    grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
+    _edge_kernels.sample_lines(
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, grey, inside
+    )  # fmt: skip
+    return grey, inside
+
+
+def smoothed_about(picture: KeptPicture, lines: ScanLines) -> tuple[NDArray[np.float32], FloatArray, FloatArray]:
+    """Smoothed grey levels of at least what lines cross, the pixel that comes first, the picture's width and height."""
     h, w = picture.image.shape
     first, last = np.empty(2), np.empty(2)
     _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, first, last)
@@ -366,14 +363,7 @@ def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[F
         min(max(math.ceil(x) + 5, least + 4), most)
         for x, least, most in zip(last.tolist(), (left, top), (w, h), strict=True)
     )
-    smooth, corner = picture.band((left, top, right, bottom))
-    n = len(lines.origin_px)
-    grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
-    _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, np.array([w, h], dtype=float),
-        grey, inside,
-    )  # fmt: skip
-    return grey, inside
+    return *picture.band((left, top, right, bottom)), np.array([w, h], dtype=float)
 
 
 def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
@@ -442,7 +432,7 @@ def second_edge(
     grey, inside = sampled(image, lines, round(2.0 * reach / STEP_PX) + 1)
     rise, first = np.empty((len(grey), grey.shape[1] - 2)), np.empty(len(grey))
     _edge_kernels.rises_over_pixel(grey, round(1.0 / STEP_PX), rise, first)
-    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * NORMAL_MAD * middle_of(np.abs(rise)))
+    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * NORMAL_MAD * _edge_kernels.middle_of_sizes(rise, _BINS))
     steps = np.empty(rise.shape, dtype=np.bool_)
     _edge_kernels.tops(rise, least, steps)
     whole = (first > 2.0 * least) & inside.all(axis=1)

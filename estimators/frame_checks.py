@@ -69,8 +69,8 @@ class Design:
         ``allowed``: sd that unmodelled lobes lend to each of its terms.
         """
         turned = by.T * self.weight
-        crossed = turned @ self.columns @ self.gain
-        inverse, right = turned @ by - crossed @ by, (turned - crossed) @ self.residual_px
+        crossed, fitted = turned @ self.columns, self.gain @ self.residual_px
+        inverse, right = turned @ by - crossed @ (self.gain @ by), turned @ self.residual_px - crossed @ fitted
         # along the axes of the inverse covariance, where it says anything
         value, axes = np.linalg.eigh(inverse)
         along, known = axes.T @ right, value > len(value) * np.finfo(float).eps * value[-1]

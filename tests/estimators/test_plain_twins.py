@@ -17,7 +17,7 @@ from estimators.edge import (
     STEP_PX,
     WHOLE_BLUR_PX,
     ScanLines,
-    middle_of,
+    is_coherent,
     steps_near,
 )
 from estimators.virtual_camera import VirtualCamera
@@ -295,11 +295,56 @@ def test_rises_and_their_tops_are_numpy_s():
     np.testing.assert_array_equal(steps, np.pad(expected, ((0, 0), (1, 1))))
 
 
+@pytest.mark.parametrize("top", [0.0, 9.0])
+def test_the_first_step_on_a_line_is_the_plain_one(top):
+    """A plain body, a step behind it, steps behind that; lines that begin or end beyond the picture, or find none."""
+    rng = np.random.default_rng(4)
+    picture = rng.normal(60.0, 1.5, (60, 80))
+    picture[:, 30:] += 40.0
+    picture[:, 44:] -= 70.0
+    picture[50:, 30:44] -= 25.0
+    picture = picture.astype(np.float32)
+    row = np.linspace(2.0, 57.0, 23)
+    origin = np.column_stack([np.linspace(0.0, 75.0, 23), row])
+    clock = np.linspace(-0.5, 0.5, 23)
+    outward, corner = np.column_stack([np.cos(clock), np.sin(clock)]), np.array([0.0, top])
+    size, count = np.array([80.0, 60.0 + top]), 97
+    origin[:, 1] += top
+    grey, inside = np.empty((23, count)), np.empty((23, count), dtype=np.bool_)
+    _edge_kernels.sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
+    limits, place = (count, 12, 4, 8.0, 4.0), np.empty(23)
+    _edge_kernels.first_lasting_steps(picture, origin, outward, -24.0, STEP_PX, corner, size, limits, place)
+    expected = plain_horizon.first_lasting_steps(grey, inside, limits)
+    np.testing.assert_allclose(place, expected, atol=1e-9)
+    assert 0 < np.isnan(place).sum() < 12
+
+
+def test_a_point_is_coherent_with_most_of_the_places_beside_it():
+    rng = np.random.default_rng(8)
+    line = np.flatnonzero(rng.random(60) < 0.8)
+    residual = np.where(rng.random(len(line)) < 0.15, np.nan, rng.normal(0.0, 0.6, len(line)))
+    alike = (np.abs(line[:, None] - line) <= 4) & (np.abs(residual[:, None] - residual) < 0.7)
+    found = is_coherent(line, residual)
+    np.testing.assert_array_equal(found, alike.sum(axis=1) > 4)
+    assert 5 < found.sum() < len(line) - 5
+    assert not len(is_coherent(line[:0], residual[:0]))
+
+
+def test_rows_differ_as_in_whole_numbers():
+    image = np.random.default_rng(9).integers(0, 256, (54, 75)).astype(np.uint8)
+    image[20:] = 255 - image[20:] // 2
+    one, two, steps = np.empty((3, 2)), np.empty((3, 2)), np.empty(53)
+    _edge_kernels.row_differences(image, 16, 32, 4, 16, one, two, steps)
+    for found, expected in zip((one, two, steps), plain_horizon.row_differences(image, 16, 32, 4, 16), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("count", [1, 2, 7, 1000])
 def test_the_middle_is_the_median(count):
     values = np.random.default_rng(count).normal(size=(count, 3))[:, :2]
-    assert middle_of(values) == np.median(values)
-    assert middle_of(values[:, 0]) == np.median(values[:, 0])
+    for levels in (values, np.rint(values), np.zeros_like(values)):
+        for some in (levels, levels[:, :1].copy()):
+            assert _edge_kernels.middle_of_sizes(some, 64) == np.median(np.abs(some))
 
 
 def patch_of(rng):

@@ -64,3 +64,35 @@ def share_of_second_edge(steps, by_turn, limits):
             if np.mean(seen) > best[0]:
                 best = (float(np.mean(seen)), float(np.hypot(a, b) / size))
     return best
+
+
+def first_lasting_steps(grey, inside, limits):
+    """Sample of each line (n, m) at which its first step from a plain beginning is steepest; NaN without one."""
+    count, plain, half, least, of_scatter = limits
+    rows, samples = np.arange(len(grey)), np.arange(count)
+    first = np.argmax(inside, axis=1)
+    level = np.minimum(first[:, None] + np.arange(plain), count - 1)
+    scatter = np.maximum(np.take_along_axis(grey, level, axis=1).std(axis=1), 1.0)
+    step = np.zeros_like(grey)
+    step[:, half:-half] = np.abs(grey[:, 2 * half :] - grey[:, : -2 * half])
+    step[~inside | (samples < first[:, None] + half)] = 0.0
+    beyond = step > np.maximum(least, of_scatter * scatter)[:, None]
+    hit = np.argmax(beyond, axis=1)
+    near = (samples >= hit[:, None]) & (samples <= hit[:, None] + 2 * half)
+    most = np.argmax(np.where(near, step, -1.0), axis=1)
+    slope = np.abs(np.gradient(grey, axis=1))
+    at = np.argmax(np.where(np.abs(samples - most[:, None]) <= half, slope, -1.0), axis=1).clip(1, count - 2)
+    before, here, after = (slope[rows, at + k] for k in (-1, 0, 1))
+    bend = np.minimum(before - 2.0 * here + after, -1e-9)
+    return np.where(beyond.any(axis=1), at + np.clip(0.5 * (before - after) / bend, -1.0, 1.0), np.nan)
+
+
+def row_differences(image, tall, wide, step, most):
+    """Mean square differences of rows next to each other, and of every other one, in blocks; mean steps of rows."""
+    few = image[:, ::step].astype(float)
+    steps = np.minimum(np.abs(np.diff(few, axis=0)), most).mean(axis=1)
+    across, down = wide // step, (len(few) - 2) // tall
+    used = image.shape[1] // wide * across
+    near, far = (few[:-2] - few[1:-1]) ** 2, (few[:-2] - few[2:]) ** 2
+    blocks = (part[: down * tall, :used].reshape(down, tall, -1, across).mean(axis=(1, 3)) for part in (near, far))
+    return *blocks, steps
