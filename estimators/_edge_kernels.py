@@ -433,26 +433,22 @@ def _scatter(grey, begin, plain, last):
 
 
 @inlined
-def _slope(grey, j, count):
-    """Size of the slope at a sample, of both neighbours where it has them."""
-    low, high = max(j - 1, 0), min(j + 1, count - 1)
-    return abs(grey[high] - grey[low]) / (high - low)
-
-
-@inlined
-def _steepest(grey, inside, hit, half, count, steps):
+def _steepest(grey, inside, hit, half, slope):
     """Place of the steepest slope of the largest step near the first one, by a parabola through three slopes."""
-    most = hit
+    count, most, largest = len(grey), hit, 0.0
     for j in range(hit, min(hit + 2 * half, count - half - 1) + 1):
-        steps[j - hit] = abs(grey[j + half] - grey[j - half]) if inside[j] else 0.0
-        if steps[j - hit] > steps[most - hit]:
-            most = j
+        size = abs(grey[j + half] - grey[j - half])
+        if inside[j] and size > largest:
+            most, largest = j, size
+    for j in range(max(most - half - 1, 0), min(most + half + 2, count)):
+        low, high = max(j - 1, 0), min(j + 1, count - 1)
+        slope[j] = abs(grey[high] - grey[low]) / (high - low)
     at = max(most - half, 0)
-    for j in range(at, min(most + half, count - 1) + 1):
-        if _slope(grey, j, count) > _slope(grey, at, count):
+    for j in range(at, min(most + half + 1, count)):
+        if slope[j] > slope[at]:
             at = j
     at = min(max(at, 1), count - 2)
-    before, here, after = _slope(grey, at - 1, count), _slope(grey, at, count), _slope(grey, at + 1, count)
+    before, here, after = slope[at - 1], slope[at], slope[at + 1]
     bend = min(before - 2.0 * here + after, -1e-9)
     return at + min(max(0.5 * (before - after) / bend, -1.0), 1.0)
 
@@ -465,7 +461,7 @@ def first_lasting_steps(image, origin, outward, first, step, corner, size, limit
     beginning's scatter. A line is sampled no farther than its step.
     """
     count, plain, half, least, of_scatter = limits
-    grey, inside, steps = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(2 * half + 1)
+    grey, inside, slope = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(count)
     for i in range(len(origin)):
         place[i] = np.nan
         begin, held, needed, hit, enough = -1, 0, count, -1, 0.0
@@ -489,7 +485,7 @@ def first_lasting_steps(image, origin, outward, first, step, corner, size, limit
                         needed = min(hit + 4 * half + 2, count)
             k += 1
         if hit >= 0:
-            place[i] = _steepest(grey, inside, hit, half, count, steps)
+            place[i] = _steepest(grey, inside, hit, half, slope)
 
 
 @kernel
