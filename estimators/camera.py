@@ -27,7 +27,7 @@ import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
 from estimators.camera_fit import Image, OrientedCamera
-from estimators.edge import no_horizon
+from estimators.edge import NO_FAULT, no_horizon
 from estimators.frame_edits import edited
 from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
 from estimators.texture import TrackedTexture
@@ -416,18 +416,26 @@ def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse answers of frames that do not show the centerbody's edge, next to one in which it has moved.
+    """Refuse answers of frames next to one in which the centerbody's edge has moved: a camera that moved stays there.
 
-    A camera that moved in its mount stays where it is. Next are the nearest frames on both sides that show that edge.
+    Such are frames that do not show that edge, and those in which it seems to have moved but might not have. Next are
+    the nearest frames on both sides that show it.
     """
     telling = np.flatnonzero(np.isfinite([fit.mount_px for fit in fits]))
-    moved = np.array([fits[k].mount_px > 0.0 for k in telling], dtype=bool)
-    words = "the camera moved in its mount before or after this frame, which does not show the centerbody's own edge"
+    seems = np.array([fits[k].mount_px > 0.0 for k in telling], dtype=bool)
+    padded = np.concatenate([[False], seems, [False]])
+    is_sure = np.array([fits[k].mount_is_sure for k in telling], dtype=bool)
+    moved = seems & (is_sure | padded[:-2] | padded[2:])
+    unseen = "the camera moved in its mount before or after this frame, which does not show the centerbody's own edge"
     out = []
     for k, fit in enumerate(fits):
-        at = int(np.searchsorted(telling, k))
-        unsure = not fit.refused and np.isnan(fit.mount_px) and bool(moved[max(at - 1, 0) : at + 1].any())
-        out.append(refused_fit(fit.horizon, Fault(words, "camera-turned")) if unsure else fit)
+        at, fault = int(np.searchsorted(telling, k)), NO_FAULT
+        if np.isnan(fit.mount_px) and moved[max(at - 1, 0) : at + 1].any():
+            fault = Fault(unseen, "camera-turned")
+        elif not np.isnan(fit.mount_px) and moved[at]:
+            words = f"the centerbody's own edge has moved by up to {fit.mount_px:.1f} px, here and in a frame beside it"
+            fault = Fault(f"{words}: the camera moved in its mount, or the picture was moved", "camera-turned")
+        out.append(refused_fit(fit.horizon, fault) if fault and not fit.refused else fit)
     return out
 
 

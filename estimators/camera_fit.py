@@ -142,7 +142,7 @@ class OrientedCamera(FrameModel):
         deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
         deformation[:2] = 0.0 if start is None else start
         with_open_plane: FrameFit | None = None
-        mount_px = self._mount_px(frame)
+        mount_px, mount_is_sure = self._mount_px(frame)
         try:
             painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
             if isinstance(painted, ImageFeatures) and len(painted.points_shell_m):
@@ -160,7 +160,7 @@ class OrientedCamera(FrameModel):
                     self._check_seen(horizon, last)
                 doubled = self._doubled(frame, horizon, deformation)
                 self._check_sharp(frame, horizon)
-                if mount_px > 0.0:
+                if mount_px > 0.0 and mount_is_sure:
                     raise NoFitError(
                         f"the centerbody's own edge has moved by {mount_px:.1f} px since the benchmark frame: the "
                         "camera moved in its mount, or the picture was moved",
@@ -178,10 +178,11 @@ class OrientedCamera(FrameModel):
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except NoFitError as refusal:
-            return refused_fit(horizon, refusal.faults[0], mount_px)
+            return refused_fit(horizon, refusal.faults[0], mount_px, mount_is_sure)
         answer = self._answer(horizon, deformation, last, basis)
         return replace(
-            answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px, with_open_plane=with_open_plane
+            answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px, mount_is_sure=mount_is_sure,
+            with_open_plane=with_open_plane,
         )  # fmt: skip
 
     def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
@@ -254,10 +255,10 @@ class OrientedCamera(FrameModel):
                 "edge-blurred",
             )
 
-    def _mount_px(self, frame: EditedFrame) -> float:
-        """How far the camera has moved in its mount, by `estimators.body_edge`; NaN where unknown."""
+    def _mount_px(self, frame: EditedFrame) -> tuple[float, bool]:
+        """How far the camera has moved in its mount, NaN where unknown, and whether that is sure: `BodyEdge`."""
         if self.body is None:
-            return float("nan")
+            return float("nan"), False
         return self.body.moved_px(frame.kept, frame.is_clear(self.body.lines.origin_px))
 
     def points_at(

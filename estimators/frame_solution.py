@@ -132,6 +132,8 @@ class FrameFit:
         Share of edge points that agree on a second edge; zero if usual.
     mount_px : float
         How far the centerbody's own edge has moved in the picture; NaN where unknown.
+    mount_is_sure : bool
+        Whether that holds for this frame by itself.
     shape : FrameShape or None
         None in an assumed plane.
     by_shape : (2, 13 (1 + c)) float or None
@@ -152,6 +154,7 @@ class FrameFit:
     contradicted: bool = False
     doubled: float = 0.0
     mount_px: float = float("nan")
+    mount_is_sure: bool = True
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
     with_open_plane: FrameFit | None = None
@@ -209,10 +212,15 @@ def least_points(horizon: HorizonLine) -> int:
     return LEAST_MARKS if horizon.is_by_hand else LEAST_POINTS
 
 
-def refused_fit(horizon: HorizonLine, reason: Fault, mount_px: float = float("nan")) -> FrameFit:
+def refused_fit(
+    horizon: HorizonLine, reason: Fault, mount_px: float = float("nan"), mount_is_sure: bool = True
+) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
-    return FrameFit(nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason, mount_px=mount_px)
+    return FrameFit(
+        nan[0], nan, nan, 0.0, float("nan"), float("nan"), 0, horizon, reason, mount_px=mount_px,
+        mount_is_sure=mount_is_sure,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
