@@ -52,7 +52,7 @@ _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a s
 _OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
 _NOT_THE_SHELL = (
     "camera-turned", "picture-warped", "picture-doubled", "edge-not-shell", "features-contradict-edge",
-    "shell-little-seen", "features-lost",
+    "halves-differ", "shell-little-seen", "features-lost",
 )  # fmt: skip
 # share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
 # (over so many frames that they are not the benchmark's neighbours alone)

@@ -121,7 +121,7 @@ def sound_design(theta_deg):
     columns, weight = rows[:, :2], np.full(len(rows), 25.0)
     gain = np.linalg.solve((columns.T * weight) @ columns, columns.T * weight)
     residual = 0.2 * rng.standard_normal(len(rows))
-    design = Design(columns, gain, rows[:, TURN], across, float(view.camera.focal_px[0]), residual, weight)
+    design = Design(columns, gain, rows[:, TURN], across, float(view.camera.focal_px[0]), residual, weight, 0)
     return design, (pixels - view.camera.centre_px) / view.camera.focal_px
 
 
@@ -151,6 +151,30 @@ def test_what_a_turn_a_zoom_or_a_warp_explains_is_no_deflection():
     bent -= explained @ np.linalg.lstsq(explained, bent)[0]
     assert code(20.0 * bent) == "picture-warped"
     assert code(0.5 * bent) == ""
+
+
+def test_two_halves_of_a_picture_have_one_deflection():
+    """Residuals that no turn and no warp explains, and of the features alone: the edge in both halves is as it was."""
+    design, _ = sound_design(3.0)
+    lobes, shape = np.deg2rad(0.1), np.zeros(17)
+    explained = np.column_stack([design.columns, design.turn, design.warp])
+    apart = design.halves @ np.deg2rad([0.9, 0.0])
+    apart -= explained @ np.linalg.lstsq(explained, apart)[0]
+
+    def fault(moved_px, edge_points=0):
+        spoilt = replace(design, residual_px=design.residual_px + moved_px, edge_points=edge_points)
+        return fault_of_fit(spoilt, 0.5, shape, lobes)
+
+    assert not fault(np.zeros(len(apart)))
+    assert fault(apart).code == "halves-differ"
+    fitted = np.linalg.lstsq(np.column_stack([design.halves, design.columns]), design.residual_px + apart)[0][:2]
+    assert numbers_in(fault(apart))[0] == pytest.approx(2.0 * np.rad2deg(np.linalg.norm(fitted)), abs=0.06)
+    assert not fault(0.1 * apart)
+    # all of them edge points, and none a feature
+    assert not fault(apart, len(apart))
+    upper = design.places[1] < np.median(design.places[1])
+    np.testing.assert_array_equal(design.halves[upper], design.columns[upper, :2])
+    np.testing.assert_array_equal(design.halves[~upper], -design.columns[~upper, :2])
 
 
 def test_a_frozen_picture_is_no_frame(frames):
