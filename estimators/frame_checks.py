@@ -28,8 +28,8 @@ USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
 # chi-square that one sound frame in 10,000 exceeds: of seventeen of shape and light, of three rotations and a focal
 # length, of twelve terms of a warp, of two components of deflection
 WORST_SHAPE, _WORST_TURN, _WORST_WARP, _WORST_HALVES = 47.6, 23.5, 39.1, 18.4
-# sd of a half's deflection by shapes that are not modelled and points that err alike: in 300 sound frames of two
-# renderers the chi-square of two with it is 8.6 at the most, in frames of which rows slip 8 to 90
+# sd of a half's deflection by shapes that are not modelled and points that err alike: with it the chi-square of two is
+# 1.5 at the most in 216 fits of sound frames, 8.6 in some of another renderer's, 8 to 90 in frames of which rows slip
 _HALF_RAD = float(np.deg2rad(0.02))
 
 
