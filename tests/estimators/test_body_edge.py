@@ -41,7 +41,7 @@ def test_a_deflection_leaves_the_centerbody_where_it_is(frames, oriented):
         assert fit.mount_px == 0.0
 
 
-def test_a_camera_that_moved_is_told_from_a_deflection_by_the_edge_alone(frames, oriented):
+def test_a_camera_that_moved_is_no_deflection_by_the_edge_alone(frames, oriented):
     """By 6 px, which the shell's edge explains by a degree."""
     blind = replace(oriented, body=None)
     picture = moved(frames[1], (0.0, -6.0))
@@ -70,7 +70,7 @@ def test_frames_that_do_not_show_it_go_with_their_neighbours():
     assert not any(fit.refused for fit in without_moved([unseen] * 3))
 
 
-def test_a_camera_that_moved_along_it_is_told_by_two_frames(frames, oriented):
+def test_a_camera_that_moved_along_it_is_noticed_in_two_frames(frames, oriented):
     """A seventh of the points lie within a pixel of where they were; one frame alone may show a shadow's edge."""
     spoilt = [oriented.fit(moved(frame, (8.0, 0.0))) for frame in frames[1:]]
     off = spoilt[0].rotation_yz_rad - oriented.fit(frames[1]).rotation_yz_rad
