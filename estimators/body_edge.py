@@ -33,9 +33,9 @@ _LEAST_STEP, _OF_SCATTER = 8.0, 4.0  # grey levels; of the body's own scatter
 _LEAST_POINTS, _LEAST_SHARE = 30, 0.25  # of the lines in view
 _SMOOTHER = 0.6  # its points may lie so much farther from their neighbours than the shell's edge's
 _SAME_PX, _LEAST_SAME = 0.7, 0.1  # of the points seen in both frames: a tilt by 7 px about one of them leaves so many
-# of the points: so many more on a moved edge than on an unmoved one, which is no longer most of it; of 250 sound frames
-# 0.15 more at the most where no shadow's edge passes for it
-_MORE_MOVED, _MOST_SAME = 0.3, 0.5
+# of the points: so many more on a moved edge than on an unmoved one, and at most so many of these; light that shifts a
+# part of the edge, as in a clean film of another renderer, leaves 0.4 where they are and as many more together
+_MORE_MOVED, _MOST_SAME = 0.3, 0.3
 _TOWARDS_PX = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.7, 0.7)  # scale of the weights, from a third of the reach down
 
 
