@@ -10,7 +10,7 @@ how many more lie where one shift and turn of the picture puts them.
 
 Assumed: the body's own shadow beside its edge, which may pass for the edge, leaves a part of the edge alone. Of 707
 frames of 66 sound films one keeps less than a tenth of its points; of a camera that moved hardly any stay. A shift and
-turn alone are not sure of one frame: in 2 of 250 sound frames a shadow's edge follows one, and in none beside them.
+turn alone are not sure of one frame: light and shadow that shift a part of the edge may look like one.
 """
 
 from __future__ import annotations
