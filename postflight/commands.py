@@ -12,20 +12,18 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from estimators.calibration import calibrate_lens, read_corners
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
-from postflight.filming import NO_VIDEO, CameraAnswer, by_camera
-from postflight.flight import Flight, read_flight
+from postflight.flight import NO_VIDEO, Flight, read_flight
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
@@ -39,6 +37,9 @@ from recon.consistency import ConsistencyCheck
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
+
+if TYPE_CHECKING:
+    from postflight.filming import CameraAnswer
 
 EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
 SHORT = {
@@ -490,6 +491,8 @@ def deflection(
                 history = answers.histories["camera"]
                 draw_camera(flight, history, out.path / "figures")
                 if film:
+                    from postflight.filming import by_camera
+
                     for name, (seen, own) in by_camera(telemetry, history).items():
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
                         write_overlay_film(seen, own, out.path / "figures" / file, progress=report)
@@ -511,6 +514,8 @@ def deflection(
 
 def calibrate(corners: Path, size: str, lens: Lens) -> None:
     """Calibrate a lens and print the lines of a vehicle file."""
+    from estimators.calibration import calibrate_lens, read_corners
+
     match = re.fullmatch(r"(\d{1,5})[x,](\d{1,5})", size.strip())
     if not match:
         raise ConfigError(f"--size {size}: width and height like 640x480 are wanted", "option-format")

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from estimators.agreement import Agreement
-from estimators.camera import sensitivity_table
-from estimators.misalignment import estimate_misalignment as misalignment_history
-from estimators.trim import estimate_trim as trim_history
 from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
-from postflight.filming import CameraAnswer, camera_answer, with_largest
 from postflight.flight import READ, RECONSTRUCT, Flight
-from postflight.flown_coefficients import AeroIncrements, increments_of
-from postflight.fusing import CameraTimeBias, FusedAnswer, fuse_flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
 from recon.consistency import ConsistencyCheck, doubt
+
+if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
+    from estimators.agreement import Agreement
+    from postflight.filming import CameraAnswer
+    from postflight.flown_coefficients import AeroIncrements
+    from postflight.fusing import CameraTimeBias, FusedAnswer
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
@@ -217,6 +217,8 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
     GateError
         Where there is no video or it cannot be used.
     """
+    from postflight.filming import camera_answer
+
     check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ} or {RECONSTRUCT}")
     if isinstance(flown, Flight):
         return camera_answer(flown, None, progress).plain
@@ -232,8 +234,10 @@ def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
     GateError
         Where there are no inertial sensors or no vehicle.
     """
+    from estimators import misalignment
+
     check_type("estimate_misalignment", bet, Reconstruction, RECONSTRUCT)
-    return misalignment_history(bet.required_loads())
+    return misalignment.estimate_misalignment(bet.required_loads())
 
 
 @on_one_thread
@@ -245,8 +249,10 @@ def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
     GateError
         Where there are no inertial sensors or no vehicle.
     """
+    from estimators import trim
+
     check_type("estimate_trim", bet, Reconstruction, RECONSTRUCT)
-    return trim_history(bet.required_loads())
+    return trim.estimate_trim(bet.required_loads())
 
 
 @on_one_thread
@@ -281,6 +287,9 @@ def estimate(
     answer, and waited for while other methods run; without it the film is read. ``tested``: the same of the test of the
     camera's time bias.
     """
+    from postflight.filming import camera_answer
+    from postflight.fusing import fuse_flight
+
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
     answers = Deflections(bet=bet)
@@ -361,6 +370,8 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
 
 def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
     """Increments; where there are none because of a late film, that is said first."""
+    from postflight.flown_coefficients import increments_of
+
     try:
         return increments_of(fused, bet.solution.settings.check_confidence, bet.telemetry.name)
     except GateError as fault:
@@ -391,6 +402,9 @@ def camera_sensitivity(flight: Flight, history: DeflectionHistory) -> pd.DataFra
     Columns ``joint_station_m, plane_lv_deg, deflection_deg, paper_deg``. It need not equal the paper's column: one
     camera sees the component towards it, and the shell and lens are not IRVE-II's.
     """
+    from estimators.camera import sensitivity_table
+    from postflight.filming import with_largest
+
     telemetry, history = with_largest(flight.telemetry, history)
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None

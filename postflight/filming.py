@@ -30,12 +30,11 @@ from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
-from postflight.flight import Flight
+from postflight.flight import NO_VIDEO, Flight
 from postflight.fusing import CAMERA_PLANE_SD_RAD
 from postflight.reconstruction import Reconstruction
 from recon.consistency import ConsistencyCheck
 
-NO_VIDEO = "video-missing"
 _SAME_FRAME_S = 1e-3
 
 

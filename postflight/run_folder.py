@@ -38,7 +38,7 @@ from flightmodel.files import abandoned, open_file, partial_path, write_file, wr
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.deflections import Deflections, no_answer_at, quantiles_at
-from postflight.filming import NO_VIDEO
+from postflight.flight import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.consistency import ConsistencyCheck
 from recon.measurements import component_unit

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray
@@ -169,6 +168,8 @@ def coasting(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray, bel
 
 def _smoothed(time_s: FloatArray, values: FloatArray, width_s: float) -> tuple[FloatArray, FloatArray]:
     """Values (n,) through the windows' kernel, on an even grid of times; NaN near gaps and ends."""
+    from scipy.integrate import cumulative_trapezoid  # a tenth of a second
+
     whole = np.isfinite(values)
     t, v = time_s[whole], values[whole]
     step = max(float(np.median(np.diff(t))), width_s / 200)

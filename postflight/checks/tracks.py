@@ -15,7 +15,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from flightmodel import earth, tables
 from flightmodel.checks import BoolArray, FloatArray
@@ -185,6 +184,8 @@ def _sharp(force: TrackForce) -> BoolArray:
 
 def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
     """Check a receiver's velocities against displacements: ``gnss-velocity-sign``, ``gnss-velocity-unit`` or none."""
+    from scipy.integrate import cumulative_trapezoid  # a tenth of a second
+
     name, t, p, v = record.spec.name, record.time_s, record.position_ecef_m, record.velocity_ecef_mps
     whole = np.isfinite(p).all(axis=1) & np.isfinite(v).all(axis=1)
     t, p, v = t[whole], p[whole], v[whole]

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from flightmodel.checks import FloatArray
 from flightmodel.tables import UNITS, Quantity, Source, place, read_unit
@@ -154,6 +153,8 @@ def slope_through_mean(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 def window_means(time_s: FloatArray, values: FloatArray, grid_s: FloatArray, low_s: float, high_s: float) -> FloatArray:
     """Return means (m, k) of samples (n, k) over windows from ``grid_s + low_s`` to ``grid_s + high_s``."""
+    from scipy.integrate import cumulative_trapezoid  # a tenth of a second
+
     total = cumulative_trapezoid(values, time_s, axis=0, initial=0.0)
     low, high = (np.column_stack([np.interp(grid_s + side, time_s, c) for c in total.T]) for side in (low_s, high_s))
     return np.asarray((high - low) / (high_s - low_s))

@@ -13,13 +13,12 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from estimators.agreement import CONFIDENCE
 from flightmodel.config import parse_utc
 from flightmodel.deflection import QUANTILES, interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL
-from postflight.report.pictures import best_method, hole_s
 from postflight.report.source import Run
+from postflight.report.view_3d import best_method, hole_s
 from postflight.run_folder import answer_table
 from postflight.sensitivity import largest_of_groups
 from recon.consistency import doubt
@@ -193,6 +192,8 @@ def _agreement(run: Run, method: str) -> dict[str, str]:
     mine = table if method == "fused" else table[[method in m.split(" and ") for m in table["methods"]]]
     if not len(mine):
         return dict(_ALONE)
+    from estimators.agreement import CONFIDENCE
+
     failed = mine[~mine["passed"].astype(bool)]
     least = f"smallest probability of a pair {mine['chance'].min():.2g}; limit {1 - CONFIDENCE:.2g}"
     if not len(failed):

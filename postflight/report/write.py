@@ -26,7 +26,7 @@ from flightmodel.config import parse_utc
 from flightmodel.files import write_file, writing
 from flightmodel.telemetry import Telemetry
 from postflight.plots.style import COLOUR, PAGE
-from postflight.report import pictures, text
+from postflight.report import text, view_3d
 from postflight.report.panels import (
     NO_DEFLECTION,
     deflection_panel,
@@ -92,18 +92,27 @@ def write_whole(target: Path, content: str) -> None:
 
 def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
     """Return the whole page."""
-    frames = pictures.film_strip(run)
+    frames, worst = _film(run)
     data, absent = _numbers(run, frames, studies)
     return rendered(
         "page.html",
         data,
         run=run,
         frames=frames,
-        worst=pictures.worst_frames(run),
+        worst=worst,
         absent=absent,
         studies=[path.resolve().name for path in studies],
         **_texts(run),
     )
+
+
+def _film(run: Run) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Film strip and worst frames; the estimators are loaded for them alone."""
+    if not {"deflection_camera", "camera_frames"} & set(run.tables):
+        return [], []
+    from postflight.report import pictures
+
+    return pictures.film_strip(run), pictures.worst_frames(run)
 
 
 def rendered(template: str, data: dict[str, Any], **texts: Any) -> str:
@@ -194,8 +203,8 @@ def _numbers(
         "rigid": rigid_panels(run),
         "studies": study_panels(run, studies),
         "residuals": residual_panels(run),
-        "solid": None if vehicle is None else pictures.solid(vehicle),
-        "poses": pictures.poses(run, rows),
+        "solid": None if vehicle is None else view_3d.solid(vehicle),
+        "poses": view_3d.poses(run, rows),
         "frames": [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
     }
     return data, absent
