@@ -20,6 +20,7 @@ NEAR_M = 0.05  # from where on the distance changes as a straight line along a r
 STEEPEST = 2.5  # of a step to the distance; it is signed, and an overshoot returns
 REACHED_M, HIT_M = 2e-4, 4e-3
 SUN_DIAMETER = 0.0093  # rad
+LANES = 1024  # rays side by side: their arrays stay in the nearest cache
 OFF_SKIN_M = 2e-3  # from where a surface point looks at the Sun
 
 
@@ -36,14 +37,14 @@ def _half_plane(x, y, z, shell, warp):
         aft, out = aft - turn * out, out + turn * aft
     a = shell[2] * aft + shell[3] * out
     b = shell[3] * aft - shell[2] * out
-    i = min(max(math.floor(a / shell[4] + 0.5), 0.0), shell[6])
+    i = min(max(np.floor(a / shell[4] + 0.5), 0.0), shell[6])  # numpy's: Python's is an integer, one ray at a time
     return a - i * shell[4], b, r
 
 
 @inlined
-def _gap(eye, d, t, shell, warp):
+def _gap(eye, dx, dy, dz, t, shell, warp):
     """Distance from the nearest torus, m, at depth ``t`` along a ray; negative inside."""
-    a, b, _ = _half_plane(eye[0] + t * d[0], eye[1] + t * d[1], eye[2] + t * d[2], shell, warp)
+    a, b, _ = _half_plane(eye[0] + t * dx, eye[1] + t * dy, eye[2] + t * dz, shell, warp)
     return math.sqrt(a * a + b * b) - shell[5]
 
 
@@ -55,7 +56,7 @@ def _thickness(shell, warp):
 
 
 @inlined
-def _way_to_stack(x, y, z, d, shell, warp):
+def _way_to_stack(x, y, z, dx, dy, dz, shell, warp):
     """Way along a direction, m, in which nothing is met, of a point aft of the stack, inside the cone that encloses it.
 
     It ends where that cone is met, and is infinite where it is not; zero for a point elsewhere.
@@ -65,35 +66,49 @@ def _way_to_stack(x, y, z, d, shell, warp):
     if above <= 0.0:
         return 0.0
     # on the cone r = p + q t
-    p, q = r + above / shell[2], -shell[3] * d[0] / shell[2]
-    square, half = d[1] * d[1] + d[2] * d[2] - q * q, y * d[1] + z * d[2] - p * q
+    p, q = r + above / shell[2], -shell[3] * dx / shell[2]
+    square, half = dy * dy + dz * dz - q * q, y * dy + z * dz - p * q
     # r^2 - p^2, which is negative: where the square's factor is positive, one root lies ahead
     rest = -(above / shell[2]) * (r + p)
-    root = half * half - square * rest
-    if root < 0.0:
-        return math.inf
-    root = math.sqrt(root)
+    root = math.sqrt(max(half * half - square * rest, 0.0))
     way = (root - half) / square if half <= 0.0 else -rest / (half + root)
-    return way if way > 0.0 and p + q * way >= 0.0 else math.inf
+    return way if half * half >= square * rest and way > 0.0 and p + q * way >= 0.0 else math.inf
 
 
 @inlined
-def _march(eye, d, shell, warp):
-    """Depth at which a ray meets a torus, m; infinite where it does not."""
-    t = max(_way_to_stack(eye[0], eye[1], eye[2], d, shell, warp), 0.05)
-    if t > shell[7]:
-        return math.inf
-    gap, stretch = _gap(eye, d, t, shell, warp), 1.0
-    for _ in range(STEPS):
-        if abs(gap) < REACHED_M or t > shell[7]:
+def _march(eye, d, pixel, lanes, depth, shell, warp):
+    """Depth, m, at which rays, columns of ``d`` (3, n), meet a torus; infinite where they do not.
+
+    Written to places ``pixel`` (n,) of ``depth``. Rays that are under way lie side by side in arrays, which a processor
+    steps several at a time; all of ``d``, ``pixel`` and ``lanes`` (3, n) is used up.
+    """
+    x, y, z = d
+    t, gap, stretch = lanes
+    count = len(pixel)
+    for k in range(count):
+        way = _way_to_stack(eye[0], eye[1], eye[2], x[k], y[k], z[k], shell, warp)
+        t[k], stretch[k] = min(max(way, 0.05), 2.0 * shell[7]), 1.0
+        gap[k] = _gap(eye, x[k], y[k], z[k], t[k], shell, warp)
+    for step in range(STEPS + 1):
+        going = 0
+        for k in range(count):
+            if abs(gap[k]) < REACHED_M or t[k] > shell[7] or step == STEPS:
+                depth[pixel[k]] = t[k] if gap[k] < HIT_M and t[k] <= shell[7] else math.inf
+            else:
+                x[going], y[going], z[going], pixel[going] = x[k], y[k], z[k], pixel[k]
+                t[going], gap[going], stretch[going] = t[k], gap[k], stretch[k]
+                going += 1
+        count = going
+        for k in range(count):
+            way, before = stretch[k] * gap[k], gap[k]
+            t[k] += way
+            gap[k] = _gap(eye, x[k], y[k], z[k], t[k], shell, warp)
+            # the secant's step, where it is one
+            closer = before - gap[k]
+            secant = min(max(way / closer, 1.0), STEEPEST)
+            stretch[k] = secant if abs(gap[k]) < NEAR_M and closer * way > 0.0 else 1.0
+        if count == 0:
             break
-        step, before = stretch * gap, gap
-        t += step
-        gap = _gap(eye, d, t, shell, warp)
-        # the secant's step, where it is one
-        closer = before - gap
-        stretch = min(max(step / closer, 1.0), STEEPEST) if abs(gap) < NEAR_M and closer * step > 0.0 else 1.0
-    return t if gap < HIT_M and t <= shell[7] else math.inf
 
 
 @inlined
@@ -121,20 +136,33 @@ def _beside_body(x, y, z, sun, body):
 
 
 @inlined
-def _beside_shell(x, y, z, sun, shell, warp):
-    """Share of the Sun's disc that the tori leave free, from a point off their skin."""
-    t, share = OFF_SKIN_M, 1.0
-    for _ in range(STEPS):
-        px, py, pz = x + t * sun[0], y + t * sun[1], z + t * sun[2]
-        a, b, _r = _half_plane(px, py, pz, shell, warp)
-        gap = math.sqrt(a * a + b * b) - shell[5]
-        if gap < REACHED_M:
-            return 0.0
-        share = min(share, gap / (SUN_DIAMETER * t))
-        t += max(gap, OFF_SKIN_M, _way_to_stack(px, py, pz, sun, shell, warp))
-        if t > shell[7]:
+def _beside_shell(points, pixel, lanes, sun, shell, warp, free):
+    """Multiply ``free`` at places ``pixel`` (n,) by the share of the Sun's disc that the tori leave free.
+
+    Seen from points (3, n) off their skin; the points, ``pixel`` and ``lanes`` are used up as by `_march`.
+    """
+    x, y, z = points
+    t, share, _ = lanes
+    count = len(pixel)
+    t[:count], share[:count] = OFF_SKIN_M, 1.0
+    for step in range(STEPS + 1):
+        going = 0
+        for k in range(count):
+            if share[k] == 0.0 or t[k] > shell[7] or step == STEPS:
+                free[pixel[k]] *= share[k]
+            else:
+                x[going], y[going], z[going], pixel[going] = x[k], y[k], z[k], pixel[k]
+                t[going], share[going] = t[k], share[k]
+                going += 1
+        count = going
+        for k in range(count):
+            px, py, pz = x[k] + t[k] * sun[0], y[k] + t[k] * sun[1], z[k] + t[k] * sun[2]
+            a, b, _r = _half_plane(px, py, pz, shell, warp)
+            gap = math.sqrt(a * a + b * b) - shell[5]
+            share[k] = 0.0 if gap < REACHED_M else min(share[k], gap / (SUN_DIAMETER * t[k]))
+            t[k] += max(gap, OFF_SKIN_M, _way_to_stack(px, py, pz, sun[0], sun[1], sun[2], shell, warp))
+        if count == 0:
             break
-    return share
 
 
 @inlined
@@ -144,7 +172,8 @@ def _albedo(y, z, r, a, crest, shell):
     gore = (clock if clock >= 0.0 else clock + 2.0 * math.pi) / shell[8]
     whole = math.floor(gore)
     off_seam = abs(gore - math.floor(gore + 0.5)) * shell[8] * r
-    off_dot = math.hypot(abs(gore - whole - 0.5) * shell[8] * r, a)
+    across = (gore - whole - 0.5) * shell[8] * r
+    off_dot = math.sqrt(across * across + a * a)
     out = (1.0 - 0.55 * min(max(1.5 - off_seam / 0.006, 0.0), 1.0)) * (1.0 + 0.05 * math.sin(2.4 * whole))
     if crest > 0.5:
         out *= 1.0 - 0.7 * min(max(3.0 - off_dot / 0.0055, 0.0), 1.0)
@@ -157,19 +186,6 @@ def _normal(y, z, a, b, r, shell):
     n_s = (a * shell[2] + b * shell[3]) / shell[5]
     n_r = (a * shell[3] - b * shell[2]) / shell[5]
     return -n_s, n_r * y / r, n_r * z / r
-
-
-@inlined
-def _free(eye, d, t, sun, shell, warp, body):
-    """Share of the Sun's disc that is seen from where a ray meets the skin."""
-    x, y, z = eye[0] + t * d[0], eye[1] + t * d[1], eye[2] + t * d[2]
-    a, b, r = _half_plane(x, y, z, shell, warp)
-    nx, ny, nz = _normal(y, z, a, b, r, shell)
-    if nx * sun[0] + ny * sun[1] + nz * sun[2] <= 0.0:
-        return 0.0
-    x, y, z = x + OFF_SKIN_M * nx, y + OFF_SKIN_M * ny, z + OFF_SKIN_M * nz
-    free = _beside_body(x, y, z, sun, body)
-    return free * _beside_shell(x, y, z, sun, shell, warp) if free > 0.0 else 0.0
 
 
 @inlined
@@ -190,66 +206,73 @@ def _into_shell(turn, ray, out):
         out[k] = turn[k, 0] * ray[0] + turn[k, 1] * ray[1] + turn[k, 2] * ray[2]
 
 
-@inlined
-def _agreed(free, i, j):
-    """What the four pixels around, of every other row and column, all see of the Sun's disc; NaN where they differ."""
-    top, left = i - i % 2, j - j % 2
-    first = free[top, left]
-    if first != 0.0 and first != 1.0:
-        return math.nan
-    bottom, right = min(top + 2, len(free) - 2 + len(free) % 2), min(left + 2, free.shape[1] - 2 + free.shape[1] % 2)
-    same = free[top, right] == first and free[bottom, left] == first and free[bottom, right] == first
-    return first if same else math.nan
-
-
 @kernel
-def cast(rays, clear, turn, eye, sun, shell, warp, body, painted, shadows, depth, shade):
-    """Depth, m, infinite where there is none, and shade (h, w) of what rays (h, w, 3), body axes, meet.
-
-    Shadows narrower than two pixels may be missed.
-    """
+def cast(rays, clear, turn, eye, shell, warp, depth):
+    """Depth (h, w), m, at which rays (h, w, 3), body axes, meet a torus; infinite where there is none."""
     h, w, _ = rays.shape
-    d = np.empty(3)
-    free = np.full((h, w), math.nan)
+    row, pixel, lanes = np.empty((3, w)), np.empty(w, dtype=np.int64), np.empty((3, w))
     for i in range(h):
+        count = 0
         for j in range(w):
             depth[i, j] = math.inf
             if clear[i, j]:
-                _into_shell(turn, rays[i, j], d)
-                depth[i, j] = _march(eye, d, shell, warp)
-                if shadows and i % 2 == 0 and j % 2 == 0 and depth[i, j] < math.inf:
-                    free[i, j] = _free(eye, d, depth[i, j], sun, shell, warp, body)
-    for i in range(h):
-        for j in range(w):
-            shade[i, j] = 0.0
-            if depth[i, j] < math.inf:
-                _into_shell(turn, rays[i, j], d)
-                seen = 1.0
-                if shadows:
-                    seen = free[i, j] if i % 2 == 0 and j % 2 == 0 else _agreed(free, i, j)
-                    if math.isnan(seen):
-                        seen = _free(eye, d, depth[i, j], sun, shell, warp, body)
-                shade[i, j] = _shade(eye, d, depth[i, j], seen, sun, shell, warp, painted)
+                _into_shell(turn, rays[i, j], row[:, count])
+                pixel[count] = j
+                count += 1
+        _march(eye, row, pixel[:count], lanes, depth[i], shell, warp)
 
 
 @kernel
-def cast_edge(rays, near, turn, eye, sun, shell, warp, body, painted, shadows, gap, depth, shade):
-    """Where rays (n, 3) come closest to the shell, beginning from depths near it: distance, depth, shade there."""
+def closest(rays, near, turn, eye, shell, warp, gap, depth):
+    """Where rays (n, 3) come closest to the shell, beginning from depths near it: distance and depth, m."""
     d = np.empty(3)
     step = 0.03
     for i in range(len(rays)):
         _into_shell(turn, rays[i], d)
         t = near[i] if near[i] < shell[7] else 1.0
         for _ in range(4):
-            before = _gap(eye, d, t - step, shell, warp)
-            here = _gap(eye, d, t, shell, warp)
-            after = _gap(eye, d, t + step, shell, warp)
+            before = _gap(eye, d[0], d[1], d[2], t - step, shell, warp)
+            here = _gap(eye, d[0], d[1], d[2], t, shell, warp)
+            after = _gap(eye, d[0], d[1], d[2], t + step, shell, warp)
             # of the parabola through three distances
             curve = max(before - 2.0 * here + after, 1e-5)
             t += min(max(0.5 * step * (before - after) / curve, -0.1), 0.1)
-        gap[i], depth[i] = _gap(eye, d, t, shell, warp), t
-        seen = _free(eye, d, t, sun, shell, warp, body) if shadows else 1.0
-        shade[i] = _shade(eye, d, t, seen, sun, shell, warp, painted)
+        gap[i], depth[i] = _gap(eye, d[0], d[1], d[2], t, shell, warp), t
+
+
+@kernel
+def see_sun(rays, depth, turn, eye, sun, shell, warp, body, free):
+    """Share (n,) of the Sun's disc that is seen from where rays (n, 3) meet the skin; found where it is NaN."""
+    points, pixel, lanes = np.empty((3, LANES)), np.empty(LANES, dtype=np.int64), np.empty((3, LANES))
+    d = np.empty(3)
+    for begin in range(0, len(rays), LANES):
+        count = 0
+        for k in range(begin, min(begin + LANES, len(rays))):
+            if not (math.isnan(free[k]) and depth[k] < math.inf):
+                continue
+            _into_shell(turn, rays[k], d)
+            x, y, z = eye[0] + depth[k] * d[0], eye[1] + depth[k] * d[1], eye[2] + depth[k] * d[2]
+            a, b, r = _half_plane(x, y, z, shell, warp)
+            nx, ny, nz = _normal(y, z, a, b, r, shell)
+            free[k] = 0.0
+            if nx * sun[0] + ny * sun[1] + nz * sun[2] > 0.0:
+                x, y, z = x + OFF_SKIN_M * nx, y + OFF_SKIN_M * ny, z + OFF_SKIN_M * nz
+                free[k] = _beside_body(x, y, z, sun, body)
+                if free[k] > 0.0:
+                    points[0, count], points[1, count], points[2, count], pixel[count] = x, y, z, k
+                    count += 1
+        _beside_shell(points, pixel[:count], lanes, sun, shell, warp, free)
+
+
+@kernel
+def shade_shell(rays, depth, free, turn, eye, sun, shell, warp, painted, shade):
+    """Radiance (n,) of the skin that rays (n, 3) meet, of shares ``free`` (n,) of the Sun's disc; zero where none."""
+    d = np.empty(3)
+    for k in range(len(rays)):
+        shade[k] = 0.0
+        if depth[k] < math.inf:
+            _into_shell(turn, rays[k], d)
+            shade[k] = _shade(eye, d, depth[k], free[k], sun, shell, warp, painted)
 
 
 @kernel
@@ -270,5 +293,6 @@ def shade_mesh(points, normals, sun, shell, body, painted, shadows, shade):
 @kernel
 def sunlit(points, sun, shell, warp, share):
     """Share (n,) of the Sun's disc that the tori leave free at points (n, 3) off them."""
-    for i in range(len(points)):
-        share[i] = _beside_shell(points[i, 0], points[i, 1], points[i, 2], sun, shell, warp)
+    n = len(points)
+    share[:] = 1.0
+    _beside_shell(points.T.copy(), np.arange(n), np.empty((3, n)), sun, shell, warp, share)

@@ -187,9 +187,39 @@ class ShellRenderer:
         in_shell = (turn, eye, turn @ sun_body, self.shell, warp_terms(warp), body)
         if geometry.mesh is not None:
             return *self._seen_mesh(geometry.mesh, in_shell, warp), self._centerbody_shade(sun_body, in_shell)
-        depth, shade = np.empty(self.sky.shape), np.empty(self.sky.shape)
-        _film_kernels.cast(self.rays, self.is_clear, *in_shell, self.painted, self.shadows, depth, shade)
+        depth = np.empty(self.sky.shape)
+        _film_kernels.cast(self.rays, self.is_clear, turn, eye, self.shell, in_shell[4], depth)
+        shade = self._shade(self.rays, depth, self._sun_seen(depth, in_shell), in_shell)
         return self._cover(in_shell, depth, shade), shade, self._centerbody_shade(sun_body, in_shell)
+
+    def _sun_seen(self, depth: FloatArray, in_shell: _InShell) -> FloatArray:
+        """Share (h, w) of the Sun's disc where four pixels around, of every other row and column, agree; else NaN.
+
+        Shadows narrower than two pixels may be missed.
+        """
+        if not self.shadows:
+            return np.ones(depth.shape)
+        turn, eye, sun, shell, warp, body = in_shell
+        (h, w), every = depth.shape, depth[::2, ::2]
+        few = np.full(every.shape, np.nan)
+        few_rays = np.ascontiguousarray(self.rays[::2, ::2]).reshape(-1, 3)
+        _film_kernels.see_sun(few_rays, every.ravel(), turn, eye, sun, shell, warp, body, few.ravel())
+        next_row, next_column = np.append(few[1:], few[-1:], axis=0), np.append(few[:, 1:], few[:, -1:], axis=1)
+        across = np.append(next_row[:, 1:], next_row[:, -1:], axis=1)
+        agree = ((few == 0.0) | (few == 1.0)) & (few == next_row) & (few == next_column) & (few == across)
+        free = np.ascontiguousarray(np.where(agree, few, np.nan).repeat(2, axis=0)[:h].repeat(2, axis=1)[:, :w])
+        free[::2, ::2] = few
+        return free
+
+    def _shade(self, rays: FloatArray, depth: FloatArray, free: FloatArray, in_shell: _InShell) -> FloatArray:
+        """Radiance of the skin that rays (..., 3) meet at depths; ``free``, the Sun's share, is completed where NaN."""
+        turn, eye, sun, shell, warp, body = in_shell
+        shade, flat = np.empty(depth.shape), rays.reshape(-1, 3)
+        _film_kernels.see_sun(flat, depth.ravel(), turn, eye, sun, shell, warp, body, free.ravel())
+        _film_kernels.shade_shell(
+            flat, depth.ravel(), free.ravel(), turn, eye, sun, shell, warp, self.painted, shade.ravel()
+        )
+        return shade
 
     def _cover(self, in_shell: _InShell, depth: FloatArray, shade: FloatArray) -> FloatArray:
         """Share (h, w) of each pixel that the shell covers; ``shade`` is completed where a pixel's middle misses it."""
@@ -197,13 +227,14 @@ class ShellRenderer:
         kernel = np.ones((7, 7), np.uint8)
         v, u = np.nonzero((cv2.dilate(hit, kernel) != cv2.erode(hit, kernel)) & self.is_clear)
         cover = hit.astype(float)
-        gap, at, there = np.empty(len(u)), np.empty(len(u)), np.empty(len(u))
-        near = cv2.erode(depth, kernel)[v, u]
-        _film_kernels.cast_edge(self.rays[v, u], near, *in_shell, self.painted, self.shadows, gap, at, there)
+        gap, at, (turn, eye, _, shell, warp, _) = np.empty(len(u)), np.empty(len(u)), in_shell
+        near, rays = cv2.erode(depth, kernel)[v, u], self.rays[v, u]
+        _film_kernels.closest(rays, near, turn, eye, shell, warp, gap, at)
         cover[v, u] = np.clip(0.5 - gap / (at / self.camera.focal_px.mean()), 0.0, 1.0)
         # at the edge the line of sight grazes the surface: its shade there is that of the whole pixel
         graze = ~hit[v, u].astype(bool)
-        shade[v[graze], u[graze]] = there[graze]
+        free = np.full(graze.sum(), np.nan if self.shadows else 1.0)
+        shade[v[graze], u[graze]] = self._shade(rays[graze], at[graze], free, in_shell)
         return cover
 
     def _earth(self, background: Background) -> Float32:

@@ -187,11 +187,9 @@ def test_rays_reach_the_far_rim_of_a_shell_of_any_size():
     station, radius = torus_circles(geometry)
     eye = np.array([-station[-1] - 0.5, -radius[-1], 0.0])
     far = np.array([-station[-1], radius[-1], 0.0]) - eye
-    depth, shade = np.empty((2, 1, 1))
-    body = (np.zeros(3), np.array([-1.0, 0.0, 0.0]), 0.2, 1.5)
+    depth = np.empty((1, 1))
     ray, everywhere = (far / np.linalg.norm(far))[None, None], np.ones((1, 1), dtype=bool)
-    _film_kernels.cast(ray, everywhere, np.eye(3), eye, np.zeros(3),
-                       shell_terms(geometry), warp_terms(None), body, False, False, depth, shade)  # fmt: skip
+    _film_kernels.cast(ray, everywhere, np.eye(3), eye, shell_terms(geometry), warp_terms(None), depth)
     # within two rings of the rim: the ray comes in under a flat angle
     assert np.linalg.norm(far) - 4.0 * geometry.torus_minor_radius_m < depth[0, 0] < np.linalg.norm(far)
 
@@ -232,6 +230,16 @@ def test_shadows_fall_where_triangles_stand_before_the_sun(off_camera, sun_deg, 
     film = dark[where] < 0.999 * lit[where]
     assert np.mean(film == shaded) > 0.97  # half shadow, and triangles of a few mm, at their borders
     assert 0.1 < shaded.mean() < 0.9
+
+
+@pytest.mark.parametrize("sun_deg", [330.0, 60.0, 200.0])
+def test_shadows_between_pixels_that_agree_are_those_of_every_pixel_s_own_ray(off_camera, monkeypatch, sun_deg):
+    camera, _ = off_camera
+    renderer, seen = ShellRenderer(GEOMETRY, camera, JOINT_M, painted=False), (D(4.5), D(191.0), sun(sun_deg))
+    few = renderer.seen(*seen)[1]
+    monkeypatch.setattr(ShellRenderer, "_sun_seen", lambda _self, depth, _shell: np.full(depth.shape, np.nan))
+    every = renderer.seen(*seen)[1]
+    assert np.mean(np.abs(few - every) > 0.02) < 1e-3  # what is narrower than two pixels
 
 
 def test_the_centerbody_lies_in_the_shadow_of_the_shell(off_camera):

@@ -139,6 +139,16 @@ def test_a_locked_joint_carries_the_difference_of_gravity(generic_vehicle):
     np.testing.assert_allclose(aux[6:9], want, atol=2e-9)
 
 
+def seen_along(rays, eye, light, shell_and_warp, body, painted, shadows):
+    """Depth and radiance (h, w) of a shell in body axes that rays (h, w, 3) meet."""
+    depth, shade = np.empty((2, *rays.shape[:2]))
+    free, flat = np.full(depth.size, np.nan if shadows else 1.0), rays.reshape(-1, 3)
+    _film_kernels.cast(rays, np.ones(depth.shape, dtype=bool), np.eye(3), eye, *shell_and_warp, depth)
+    _film_kernels.see_sun(flat, depth.ravel(), np.eye(3), eye, light, *shell_and_warp, body, free)
+    _film_kernels.shade_shell(flat, depth.ravel(), free, np.eye(3), eye, light, *shell_and_warp, painted, shade.ravel())
+    return depth, shade
+
+
 @pytest.mark.parametrize("bent", [None, film.Warp(0.01, -0.006, 0.004, 0.005, -0.003)])
 def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
     geometry = generic_vehicle.geometry
@@ -148,9 +158,7 @@ def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     shell, warp = film.shell_terms(geometry), film.warp_terms(bent)
     body = (np.zeros(3), np.array([-1.0, 0.0, 0.0]), 0.19, 1.5)
-    depth, shade = np.empty((2, 8, 5))
-    everywhere = np.ones((8, 5), dtype=bool)
-    _film_kernels.cast(rays, everywhere, np.eye(3), eye, light, shell, warp, body, True, False, depth, shade)
+    depth, shade = seen_along(rays, eye, light, (shell, warp), body, True, False)
     stack = plain_film.Stack(geometry)
     stack.warp = bent
     plain = plain_film.Rays(rays.reshape(-1, 3).T.astype(np.float32), eye)
@@ -160,9 +168,8 @@ def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
     np.testing.assert_array_equal(np.isfinite(depth), met)
     np.testing.assert_allclose(depth[met], t.reshape(8, 5)[met], atol=2e-3)
     np.testing.assert_allclose(shade[met], stack.shade(plain, t, light).reshape(8, 5)[met], atol=0.01)
-    near, closest, there = np.empty((3, 40))
-    _film_kernels.cast_edge(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, light, shell, warp, body, True, False,
-                            near, closest, there)  # fmt: skip
+    near, closest = np.empty((2, 40))
+    _film_kernels.closest(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, shell, warp, near, closest)
     want, far = stack.closest(plain, t)
     np.testing.assert_allclose(near, far, atol=1e-4)
     np.testing.assert_allclose(closest, want, atol=2e-3)
@@ -205,12 +212,9 @@ def test_the_film_s_shadows_are_those_of_a_sampled_ray(generic_vehicle):
         film.shell_terms(geometry),
         film.warp_terms(None),
     )
-    everywhere = np.ones((3, 12), dtype=bool)
-    lit, dark, depth = np.empty((3, 3, 12))
-    for shadows, shade in ((False, lit), (True, dark)):
-        _film_kernels.cast(rays, everywhere, np.eye(3), eye, light, shell, warp, body, False, shadows, depth, shade)
-    unlit = np.empty((3, 12))
-    _film_kernels.cast(rays, everywhere, np.eye(3), eye, 0.0 * light, shell, warp, body, False, False, depth, unlit)
+    depth, lit = seen_along(rays, eye, light, (shell, warp), body, False, False)
+    _, dark = seen_along(rays, eye, light, (shell, warp), body, False, True)
+    _, unlit = seen_along(rays, eye, 0.0 * light, (shell, warp), body, False, False)
     stack, seen = plain_film.Stack(geometry), []
     for i, j in zip(*np.nonzero((lit - unlit > 0.05) & np.isfinite(depth)), strict=True):
         at = eye + depth[i, j] * rays[i, j] + np.arange(0.01, 3.0, 0.001)[:, None] * light
