@@ -309,9 +309,12 @@ def estimate(
             else:
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
-                camera = filmed.plain if filmed is not None and used else _camera_for_fusion(flight, answers.refused)
-                time_bias_s = min((film.time_bias_sd_s for film in flight.telemetry.films.values()), default=0.0)
-                fused = fuse_flight(bet.required_loads(), camera, time_bias_s, tested if used else lambda: None)
+                camera = filmed.plain if filmed is not None and used else None
+                if camera is None and "camera" not in answers.refused:
+                    camera = camera_for_fusion(flight)
+                fused = fuse_flight(
+                    bet.required_loads(), camera, _time_bias_sd_s(flight), tested if used else lambda: None
+                )
                 history = fused.fused.history
         except GateError as fault:
             answers.refused[method] = Fault(str(fault), fault.codes[0])
@@ -386,9 +389,25 @@ def _part(report: Progress, number: int, parts: int) -> Progress:
     return lambda fraction, what: report((number + fraction) / parts, what)
 
 
-def _camera_for_fusion(flight: Flight, refused: dict[str, Fault]) -> DeflectionHistory | None:
+def _time_bias_sd_s(flight: Flight) -> float:
+    return min((film.time_bias_sd_s for film in flight.telemetry.films.values()), default=0.0)
+
+
+def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> DeflectionHistory | None:
+    """Fused deflection alone, without a test of the camera's time bias; None where there is none."""
+    from postflight.fusing import fuse_flight
+
+    try:
+        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), lambda: (None,))
+    except GateError:
+        return None
+    found = answer.fused.history
+    return found if np.isfinite(found.theta_rad).any() else None
+
+
+def camera_for_fusion(flight: Flight) -> DeflectionHistory | None:
     """Camera's history where the camera itself was not asked for; None without usable video."""
-    if "camera" in refused or not flight.telemetry.films:
+    if not flight.telemetry.films:
         return None
     try:
         return estimate_camera(flight)

@@ -26,6 +26,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle
 from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
+from postflight.deflections import camera_for_fusion
 from postflight.flight import RECONSTRUCT, Flight
 from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
 from postflight.plots.style import draw
@@ -161,8 +162,9 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         require_damping(telemetry.required_vehicle())
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
+        second.ask(camera_for_fusion, Flight(telemetry))
         flight = reconstruct(Flight(telemetry), progress=lambda f, what: report(0.02 + 0.18 * f, what))
-        second.ask(without_fit, flight)
+        second.ask(without_fit, flight, second.answer())
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds

@@ -28,7 +28,7 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
-from postflight.deflections import estimate
+from postflight.deflections import fused_history
 from postflight.reconstruction import Reconstruction, fastest_radps
 from synthetic_flight import simulate
 from synthetic_flight.dispersions import (
@@ -235,6 +235,6 @@ def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) 
     return replace(profile, log_density_ratio=ratio, wind_ned_mps=wind)
 
 
-def without_fit(flight: Reconstruction) -> tuple[DeflectionHistory | None, Bounds]:
-    """Fused deflection, and bands of entries with the joint locked."""
-    return estimate(flight, ("fused",)).histories.get("fused"), entry_bounds(flight, None, ENTRIES)
+def without_fit(flight: Reconstruction, camera: DeflectionHistory | None) -> tuple[DeflectionHistory | None, Bounds]:
+    """Fused deflection, with what the camera reads without a trajectory, and bands of entries with the joint locked."""
+    return fused_history(flight, camera), entry_bounds(flight, None, ENTRIES)
