@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, IntArray
 from recon import ekf, propagation, setup, single_faults, smoother
 from recon._measurement_kernels import DECELERATION
 from recon.consistency import ConsistencyCheck, consistency_check
@@ -48,6 +48,8 @@ _LEAST_ODDS = float(np.log(1000.0))  # of one phase over another
 _CLEAR = 30.0  # logarithm of odds beyond which a part is none of the likely ones
 _MOST_PEAKS = 8  # of the likely parts that are tried with the whole prior
 _MOST_PARTS = 200  # a minute of computing
+# of a longer flight, which leaves more phases open: their time would grow with its square
+_COARSE_NODES, _COARSE_TURN_RAD = 1800, 0.1
 
 
 @dataclass(frozen=True)
@@ -188,21 +190,48 @@ def _chosen_phase(thinned: Problem, engine: str) -> tuple[States | None, SpinPha
         likelihood, _ = single_faults.log_likelihood(last, run)
         return likelihood, float(states.sensor_errors[0, 9:18] @ phase_by), states
 
-    found: list[tuple[float, States]] = []
+    found: list[tuple[float, float, States]] = []
+    coarse, kept = _coarse(thinned)
     for phase in 2.0 * _FOLLOWED_RAD * np.arange(-most, most + 1):
-        part = replace(thinned, start=boxplus(thinned.start, p * phase / phase_sd**2), start_covariance=narrow)
-        likelihood, _, states = reached(part)
+        part = replace(coarse, start=boxplus(thinned.start, p * phase / phase_sd**2), start_covariance=narrow)
+        likelihood, there, states = reached(part)
         if np.isfinite(likelihood):
-            found.append((likelihood - 0.5 * (phase / phase_sd) ** 2, states))
+            found.append((likelihood - 0.5 * (phase / phase_sd) ** 2, there, states))
     if not found:
         return None, None
-    found.sort(key=lambda one: -one[0])
+    likely = _likely(found)
+    if len(kept) < len(thinned.time_s):
+        likely = [propagation.fill_between(thinned.motion, thinned.node_index, kept, states) for states in likely]
     # with the whole prior parts of one phase come together
-    peaks = [reached(thinned, states) for value, states in found[:_MOST_PEAKS] if value > found[0][0] - _CLEAR]
+    peaks = [reached(thinned, states) for states in likely]
     best, phase, states = max(peaks, key=lambda one: one[0])
     # by more than half a turn: another count of turns is off by a whole one where force shows it, more at the end
     others = [one[0] for one in peaks if abs(one[1] - phase) > np.pi]
     return states, SpinPhase(len(found), phase_sd, float(best - max(others, default=-np.inf)))
+
+
+def _likely(found: list[tuple[float, float, States]]) -> list[States]:
+    """States of the likeliest part of each count of turns, the likeliest first, of (likelihood, phase, states)."""
+    chosen: list[tuple[float, float, States]] = []
+    for one in sorted(found, key=lambda part: -part[0]):
+        new = all(abs(one[1] - other[1]) > np.pi for other in chosen)
+        if new and len(chosen) < _MOST_PEAKS and (not chosen or one[0] > chosen[0][0] - _CLEAR):
+            chosen.append(one)
+    return [states for _, _, states in chosen]
+
+
+def _coarse(thinned: Problem) -> tuple[Problem, IntArray]:
+    """Problem on at most about `_COARSE_NODES` nodes, and which these are; as it is where it has no more.
+
+    It finds the likely parts alone, which are then compared on all nodes.
+    """
+    step_s = float(thinned.time_s[-1] - thinned.time_s[0]) / _COARSE_NODES
+    if step_s <= THINNED_STEP_S:
+        return thinned, np.arange(len(thinned.time_s))
+    coarse, kept = thinned.thinned(step_s)
+    fastest_radps = float(np.linalg.norm(thinned.motion.rate_sensor_radps, axis=1).max())
+    motion, node_index = propagation.decimated(coarse.motion, coarse.node_index, _COARSE_TURN_RAD / fastest_radps)
+    return replace(coarse, motion=motion, node_index=node_index), kept
 
 
 def _phase_by_gyros(thinned: Problem, engine: str) -> FloatArray | None:

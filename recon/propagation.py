@@ -193,6 +193,37 @@ def inertial_motion(
     return motion._replace(planet=planet), np.searchsorted(t, node_time_s).astype(np.int64)
 
 
+def decimated(motion: Motion, node_index: IntArray, step_s: float) -> tuple[Motion, IntArray]:
+    """Inertial sensors' motion on its nodes (n,) and at steps between, with the same integrals; each node's index.
+
+    Parameters
+    ----------
+    step_s : float
+        Of the new grid; coning within it is lost.
+    """
+    nodes = motion.time_s[node_index]
+    t = _with_nodes(np.arange(nodes[0], nodes[-1], step_s), nodes)
+    if len(t) >= len(motion.time_s):
+        return motion, node_index
+    # means between the middles of steps, of which the straight joins have the integral
+    ends = np.concatenate([t[:1], 0.5 * (t[1:] + t[:-1]), t[-1:]])
+
+    def means(samples: FloatArray) -> FloatArray:
+        part = 0.5 * (samples[1:] + samples[:-1]) * np.diff(motion.time_s)[:, None]
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(part, axis=0)])
+        return np.diff(interpolate_rows(ends, motion.time_s, total), axis=0) / np.diff(ends)[:, None]
+
+    held = np.searchsorted(motion.time_s, t + SAME_INSTANT_S, side="right") - 1
+    coarse = motion._replace(
+        time_s=t,
+        force_sensor_mps2=means(motion.force_sensor_mps2),
+        rate_sensor_radps=means(motion.rate_sensor_radps),
+        force_density=motion.force_density[held],
+        rate_density=motion.rate_density[held],
+    )
+    return coarse, np.searchsorted(t, nodes).astype(np.int64)
+
+
 def _with_nodes(between: FloatArray, node_time_s: FloatArray) -> FloatArray:
     """Nodes and the times between that are at no node's instant, in order."""
     near = np.clip(np.searchsorted(node_time_s, between), 1, len(node_time_s) - 1)
