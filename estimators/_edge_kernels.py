@@ -12,11 +12,12 @@ from flightmodel._kernels import inlined, kernel
 
 _TURNS_BESIDE = 2  # on either side of the middle of a square of turns, all of which are left out at once
 _ROUNDING_PX = 1e-9
+_BLOCK = 36  # samples of a line at once: most steps lie in the second block of a hundred
 
 
 @inlined
 def _grey_inside(image, u, v):
-    """As `_grey_at`, for places that lie in the picture."""
+    """Grey level between pixels, bilinear, of a place that lies in the picture."""
     j, i = int(u), int(v)
     a, b = u - j, v - i
     upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
@@ -24,10 +25,92 @@ def _grey_inside(image, u, v):
 
 
 @inlined
+def _spare(image, count):
+    """Room for so many samples: their pixels' places in the flat picture, shares beyond them, and four levels."""
+    at, levels = np.empty(count, dtype=np.int32), np.empty((4, count), dtype=image.dtype)
+    return at, np.empty(count), np.empty(count), levels
+
+
+@inlined
+def _places_along(u, v, du, dv, first, step, corner_u, corner_v, width, at, right, below):
+    """Places of samples (n,), ``first + k step`` along (du, dv) from (u, v), in the picture from ``corner`` on."""
+    for k in range(len(at)):
+        # of 32 bits: others cannot be made from places in vector registers
+        along = first + np.int32(k) * step
+        x, y = u + along * du - corner_u, v + along * dv - corner_v
+        j, i = np.int32(x), np.int32(y)
+        at[k] = i * np.int32(width) + j
+        right[k], below[k] = x - j, y - i
+
+
+@inlined
+def _levels_there(flat, width, count, spare, grey):
+    """As `_grey_inside`, of so many samples; the loads by themselves, so that all else runs in vector registers."""
+    at, right, below, four = spare
+    one, next_row = np.uint64(1), np.uint64(width)
+    for k in range(count):
+        here = np.uint64(at[k])
+        four[0, k], four[1, k] = flat[here], flat[here + one]
+        four[2, k], four[3, k] = flat[here + next_row], flat[here + next_row + one]
+    for k in range(count):
+        a, b = right[k], below[k]
+        upper = (1.0 - a) * four[0, k] + a * four[1, k]
+        grey[k] = (1.0 - b) * upper + b * ((1.0 - a) * four[2, k] + a * four[3, k])
+
+
+@inlined
+def _levels_along(flat, width, line, first, step, corner, count, spare, grey):
+    """As `_grey_inside`, of so many samples of a line, from (u, v) along (du, dv), in a piece of the picture."""
+    at, right, below, _ = spare
+    u, v, du, dv = line
+    _places_along(
+        u, v, du, dv, first, step, corner[0], corner[1], width, at[:count], right[:count], below[:count]
+    )  # fmt: skip
+    _levels_there(flat, width, count, spare, grey)
+
+
+@inlined
+def _span_within(at, along, low, high, first, last):
+    """Part of a line from ``first`` to ``last`` whose coordinate, ``at`` and so much a pixel along, lies within."""
+    if along == 0.0:
+        return (first, last) if low < at < high else (last, first)
+    one, two = (low - at) / along, (high - at) / along
+    return max(first, min(one, two)), min(last, max(one, two))
+
+
+@inlined
+def _inner_samples(line, first, step, count, image, corner, size):
+    """First and one beyond the last sample of a line that surely lie in the picture, and in the piece of it.
+
+    ``corner`` is the upper left pixel of the piece, ``size`` the picture's.
+    """
+    u, v, du, dv = line
+    h, w = image.shape
+    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
+    begin, end = _span_within(u, du, max(corner[0], 0.0), high_u, first, first + (count - 1) * step)
+    begin, end = _span_within(v, dv, max(corner[1], 0.0), high_v, begin, end)
+    # a sample at a border is left to the comparison with it
+    low = int((begin - first) / step) + 2 if begin > first else 0
+    high = int((end - first) / step) - 1 if end < first + (count - 1) * step else count
+    return min(max(low, 0), count), min(max(high, low, 0), count)
+
+
+@inlined
 def _grey_at(image, u, v):
     """Grey level between pixels, bilinear; the border's beyond the picture."""
     h, w = image.shape
     return _grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
+
+
+@inlined
+def _grey_across_border(image, line, first, step, begin, end, corner, size, grey, inside):
+    """Levels of samples from ``begin`` up to ``end`` of a line that may leave the picture, and which lie in it."""
+    u0, v0, du, dv = line
+    for k in range(begin, end):
+        along = first + k * step
+        u, v = u0 + along * du, v0 + along * dv
+        inside[k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
+        grey[k] = _grey_at(image, u - corner[0], v - corner[1])
 
 
 @inlined
@@ -196,25 +279,14 @@ def band_of_lines(origin, inward, outer, inner, low, high):
 def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape
-    h, w = image.shape
-    low_u, low_v = max(corner[0], 0.0), max(corner[1], 0.0)
-    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
+    flat, width, spare = image.ravel(), image.shape[1], _spare(image, m)
     for i in range(n):
-        u0, v0 = origin[i, 0] + first * inward[i, 0], origin[i, 1] + first * inward[i, 1]
-        u1, v1 = u0 + (m - 1) * step * inward[i, 0], v0 + (m - 1) * step * inward[i, 1]
-        # a line whose ends lie inside does
-        if low_u < min(u0, u1) and max(u0, u1) < high_u and low_v < min(v0, v1) and max(v0, v1) < high_v:
-            for k in range(m):
-                along = first + k * step
-                u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
-                inside[i, k] = True
-                grey[i, k] = _grey_inside(image, u - corner[0], v - corner[1])
-            continue
-        for k in range(m):
-            along = first + k * step
-            u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
-            inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-            grey[i, k] = _grey_at(image, u - corner[0], v - corner[1])
+        line = origin[i, 0], origin[i, 1], inward[i, 0], inward[i, 1]
+        begin, end = _inner_samples(line, first, step, m, image, corner, size)
+        _grey_across_border(image, line, first, step, 0, begin, corner, size, grey[i], inside[i])
+        inside[i, begin:end] = True
+        _levels_along(flat, width, line, first + begin * step, step, corner, end - begin, spare, grey[i, begin:])
+        _grey_across_border(image, line, first, step, end, m, corner, size, grey[i], inside[i])
 
 
 @kernel
@@ -379,8 +451,9 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
     is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
     """
     m = 2 * reach + 1
-    dip = np.empty(m)
+    dip, grey, spare = np.empty(m), np.empty(3 * m), _spare(image, 3 * m)
     h, w = image.shape
+    flat, (at, share_u, share_v, _) = image.ravel(), spare
     for i in range(len(origin)):
         sd[i] = np.inf
         du, dv = across[i]
@@ -390,10 +463,14 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
             if not (reach + 2 <= u0 <= w - reach - 3 and reach + 2 <= v0 <= h - reach - 3):
                 sd[i] = np.inf
                 break
+            for c in range(3):
+                part, off_u, off_v = slice(c * m, c * m + m), (c - 1) * dv, (1 - c) * du
+                _places_along(
+                    u0, v0, du, dv, -reach, 1.0, off_u, off_v, w, at[part], share_u[part], share_v[part]
+                )  # fmt: skip
+            _levels_there(flat, w, 3 * m, spare, grey)
             for k in range(m):
-                u, v = u0 + (k - reach) * du, v0 + (k - reach) * dv
-                beside = _grey_inside(image, u - dv, v + du) + _grey_inside(image, u + dv, v - du)
-                dip[k] = (_grey_inside(image, u, v) + beside) / 3.0
+                dip[k] = (grey[m + k] + (grey[k] + grey[2 * m + k])) / 3.0
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
             deepest = 0
             for k in range(m):
@@ -462,28 +539,34 @@ def first_lasting_steps(image, origin, outward, first, step, corner, size, limit
     """
     count, plain, half, least, of_scatter = limits
     grey, inside, slope = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(count)
+    flat, width, spare = image.ravel(), image.shape[1], _spare(image, count)
     for i in range(len(origin)):
+        line = origin[i, 0], origin[i, 1], outward[i, 0], outward[i, 1]
+        inner = _inner_samples(line, first, step, count, image, corner, size)
         place[i] = np.nan
         begin, held, needed, hit, enough = -1, 0, count, -1, 0.0
-        k = 0
+        k, tried = 0, half
         while k < needed:
-            along = first + k * step
-            u, v = origin[i, 0] + along * outward[i, 0], origin[i, 1] + along * outward[i, 1]
-            inside[k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-            grey[k] = _grey_at(image, u - corner[0], v - corner[1])
-            if begin < 0 and inside[k]:
-                begin = k
-            if begin >= 0 and k == min(begin + plain, count) - 1:
-                held = k + 1
+            upto = min(k + _BLOCK, needed)
+            if inner[0] <= k and upto <= inner[1]:
+                inside[k:upto] = True
+                _levels_along(flat, width, line, first + k * step, step, corner, upto - k, spare, grey[k:])
+            else:
+                _grey_across_border(image, line, first, step, k, upto, corner, size, grey, inside)
+            while begin < 0 and k < upto:
+                if inside[k]:
+                    begin, tried = k, k + half
+                k += 1
+            if begin >= 0 and held == 0 and upto >= min(begin + plain, count):
+                held = min(begin + plain, count)
                 enough = max(least, of_scatter * max(_scatter(grey, begin, plain, held), 1.0))
             # once the beginning is known, every sample so far may be the end of a step
-            start = begin + half if k == held - 1 else k - half
-            if held > 0 and hit < 0:
-                for j in range(max(start, begin + half, half), k - half + 1):
-                    if hit < 0 and inside[j] and abs(grey[j + half] - grey[j - half]) > enough:
-                        hit = j
-                        needed = min(hit + 4 * half + 2, count)
-            k += 1
+            while held > 0 and hit < 0 and tried < upto - half:
+                if inside[tried] and abs(grey[tried + half] - grey[tried - half]) > enough:
+                    hit = tried
+                    needed = min(hit + 4 * half + 2, count)
+                tried += 1
+            k = upto
         if hit >= 0:
             place[i] = _steepest(grey, inside, hit, half, slope)
 
