@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from estimators._sight_kernels import pixel_of
 from flightmodel._kernels import inlined, kernel
 
 _TURNS_BESIDE = 2  # on either side of the middle of a square of turns, all of which are left out at once
@@ -442,7 +443,7 @@ def square_of_model(left, good, noise, beside, square):
             square[i] = max(mean / m - noise * noise * per, 0.0)
 
 
-@kernel
+@inlined
 def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset, sd):
     """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
 
@@ -495,6 +496,27 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
             squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
             sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
         offset[i] = centre
+
+
+@kernel
+def find_dark(image, points, terms, lens, across, search, floor, place, sd):
+    """Place (n,) along unit vectors (n, 2) of dark features at points (n, 3) of the shell, and its sd, over a ``floor``.
+
+    ``terms``, ``lens``: as of `estimators._sight_kernels.project_points`. ``search``: reach, half widths, signs and
+    noise, as of `dark_centres`.
+    """
+    n = len(points)
+    expected = np.empty((n, 2))
+    for i in range(n):
+        u, v = pixel_of(points[i], terms, lens)
+        # what the lens does not see lies far from the picture
+        expected[i, 0], expected[i, 1] = (u, v) if math.isfinite(u) else (-1e6, -1e6)
+    reach, half_widths, signs, noise = search
+    place[:] = 0.0
+    dark_centres(image, expected, across, reach, half_widths, signs, noise, place, sd)
+    for i in range(n):
+        place[i] += expected[i, 0] * across[i, 0] + expected[i, 1] * across[i, 1]
+        sd[i] = math.sqrt(sd[i] * sd[i] + floor * floor)
 
 
 @inlined

@@ -132,20 +132,22 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 @inlined
 def _add_points(few, weights, normal):
-    """Add weighted products of points' columns (4, 20) to normal equations (20, 20)."""
-    for a in range(_WIDE):
-        w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
-        w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
-        for b in range(_WIDE):
-            normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+    """Add weighted products of points' columns (4, 20) to the lower half of normal equations (20, 20)."""
+    for block in range(_WIDE // _AT_ONCE):
+        for c in range(_AT_ONCE):
+            a = _AT_ONCE * block + c
+            w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
+            w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
+            for b in range(_AT_ONCE * (block + 1)):
+                normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
 
 
 @inlined
 def _add_prior(prior, flattening, k, normal, right):
-    """Take the right side (n,) out of the last column, and add means and sd on all but ``k`` of a deflection."""
+    """Take the right side (n,) out of the last row, and add means and sd on all but ``k`` of a deflection."""
     mean, sd = prior
     for a in range(len(right)):
-        right[a] = normal[a, _WIDE - 1]
+        right[a] = normal[_WIDE - 1, a]
         if a >= k:
             normal[a, a] += 1.0 / sd[a - k] ** 2
             right[a] += mean[a - k] / sd[a - k] ** 2

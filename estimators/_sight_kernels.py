@@ -67,6 +67,43 @@ def _pinhole_sight(x, y, z, k):
 
 
 @inlined
+def _from_joint_and_eye(point, terms, position, axes):
+    """Point of the deformed shell from the joint, body axes, and from the eye, camera axes; see `project_points`.
+
+    Last: its motion aft and outboard per radian of flattening, and the unit vector outboard.
+    """
+    rotation, _, joint, flattening, ring_station, ring_radius = terms
+    px, py, pz = point
+    radius = math.sqrt(py * py + pz * pz)
+    ey, ez = (py / radius, pz / radius) if radius > 0.0 else (0.0, 0.0)
+    fx, fr = -(radius - ring_radius), px + ring_station
+    ax = px + flattening * fx + joint
+    ay, az = py + flattening * fr * ey, pz + flattening * fr * ez
+    # arm from the joint, body axes
+    bx = rotation[0, 0] * ax + rotation[0, 1] * ay + rotation[0, 2] * az
+    by = rotation[1, 0] * ax + rotation[1, 1] * ay + rotation[1, 2] * az
+    bz = rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az
+    dx, dy, dz = bx - joint - position[0], by - position[1], bz - position[2]
+    x = axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz
+    y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
+    z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
+    return (bx, by, bz), (x, y, z), (fx, fr), (ey, ez)
+
+
+@inlined
+def pixel_of(point, terms, lens):
+    """As `project_points`, of one point, without derivatives."""
+    model, half_field, focal, centre, k, position, axes = lens
+    _, (x, y, z), _, _ = _from_joint_and_eye(point, terms, position, axes)
+    off_axis = math.sqrt(x * x + y * y)
+    angle = math.atan2(off_axis, z)
+    if angle >= half_field:
+        return np.nan, np.nan
+    sight = _fisheye_sight(x, y, z, off_axis, angle, k) if model == FISHEYE else _pinhole_sight(x, y, z, k)
+    return focal[0] * sight[0] + centre[0], focal[1] * sight[1] + centre[1]
+
+
+@inlined
 def project_points(points, terms, lens, pixels, jacobian):
     """Pixels ``(n, 2)`` of shell points ``(n, 3)`` and their derivatives ``(n, 2, 16)``; NaN outside the lens's field.
 
@@ -78,20 +115,7 @@ def project_points(points, terms, lens, pixels, jacobian):
     model, half_field, focal, centre, k, position, axes = lens
     by_body = np.empty((2, 3))
     for i in range(len(points)):
-        px, py, pz = points[i]
-        radius = math.sqrt(py * py + pz * pz)
-        ey, ez = (py / radius, pz / radius) if radius > 0.0 else (0.0, 0.0)
-        fx, fr = -(radius - ring_radius), px + ring_station
-        ax = px + flattening * fx + joint
-        ay, az = py + flattening * fr * ey, pz + flattening * fr * ez
-        # arm from the joint, outboard and flattening directions, body axes
-        bx = rotation[0, 0] * ax + rotation[0, 1] * ay + rotation[0, 2] * az
-        by = rotation[1, 0] * ax + rotation[1, 1] * ay + rotation[1, 2] * az
-        bz = rotation[2, 0] * ax + rotation[2, 1] * ay + rotation[2, 2] * az
-        dx, dy, dz = bx - joint - position[0], by - position[1], bz - position[2]
-        x = axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz
-        y = axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz
-        z = axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz
+        (bx, by, bz), (x, y, z), (fx, fr), (ey, ez) = _from_joint_and_eye(points[i], terms, position, axes)
         off_axis = math.sqrt(x * x + y * y)
         angle = math.atan2(off_axis, z)
         if angle >= half_field:

@@ -145,13 +145,13 @@ class ImageFeatures:
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
     ) -> tuple[FloatArray, FloatArray]:
         """See `Features.find`."""
-        expected = view.sight(self.points_shell_m, deformation).pixels
-        expected[~np.isfinite(expected[:, 0])] = -1e6
-        offset, sd = np.zeros(len(expected)), np.full(len(expected), np.inf)
-        _edge_kernels.dark_centres(
-            image, expected, self.across_px, reach_px, self.half_width_px, self.signs, _NOISE_GREY, offset, sd
-        )
-        return np.einsum("ni,ni->n", expected, self.across_px) + offset, np.hypot(sd, _SD_FLOOR_PX)
+        place, sd = np.empty((2, len(self.points_shell_m)))
+        search = (reach_px, self.half_width_px, self.signs, _NOISE_GREY)
+        _edge_kernels.find_dark(
+            image, self.points_shell_m, view.terms(deformation), view.camera.lens_terms, self.across_px, search,
+            _SD_FLOOR_PX, place, sd,
+        )  # fmt: skip
+        return place, sd
 
 
 def visible_features(view: VirtualCamera) -> ImageFeatures:

@@ -152,22 +152,20 @@ class VirtualCamera:
         mesh = self.geometry.mesh
         return None if mesh is None else render(self.camera, mesh.vertices_m, mesh.faces)
 
-    def _rotation(self, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rotation matrix (3, 3) of a deformation, and the y and z columns (3, 2) of its left Jacobian."""
+    def terms(self, deformation: FloatArray) -> tuple[FloatArray, FloatArray, float, float, float, float]:
+        """A deformation (3,) in the compiled projection: see `estimators._sight_kernels.project_points`."""
         rotation, left = np.empty((3, 3)), np.empty((3, 2))
         _sight_kernels.rotation_matrix(float(deformation[0]), float(deformation[1]), rotation, left)
-        return rotation, left
+        return rotation, left, self.joint_station_m, float(deformation[2]), *self._ring
 
     def sight(self, points_shell_m: FloatArray, deformation: FloatArray) -> Sight:
         """Project points ``(n, 3)`` of the undeflected shell, m from the datum, for a deformation.
 
         ``deformation`` (3,) is the shell's rotation vector against the body about body y and z and its flattening, rad.
         """
-        rotation, left = self._rotation(deformation)
-        terms = (rotation, left, self.joint_station_m, float(deformation[2]), *self._ring)
         pixels, jacobian = np.empty((len(points_shell_m), 2)), np.empty((len(points_shell_m), 2, 16))
         _sight_kernels.project_shell(
-            np.ascontiguousarray(points_shell_m), terms, self.camera.lens_terms, pixels, jacobian
+            np.ascontiguousarray(points_shell_m), self.terms(deformation), self.camera.lens_terms, pixels, jacobian
         )
         return Sight(pixels, jacobian)
 
