@@ -224,16 +224,17 @@ def row_differences(image, tall, wide, step, most, one, two, steps):
     h = image.shape[0]
     across = wide // step
     columns, used = (image.shape[1] + step - 1) // step, one.shape[1] * across
-    line = np.zeros((3, columns), dtype=np.int32)
-    near, far = np.zeros(columns, dtype=np.int32), np.zeros(columns, dtype=np.int32)
+    # whole numbers, sums below 2^24: exact, and half as wide as the compiler's integers
+    line, limit = np.zeros((3, columns), dtype=np.float32), np.float32(most)
+    near, far = np.zeros(columns, dtype=np.float32), np.zeros(columns, dtype=np.float32)
     for i in range(h):
-        new = line[i % 3]
+        new, row = line[i % 3], image[i]
         for j in range(columns):
-            new[j] = image[i, j * step]
+            new[j] = row[j * step]
         if i > 0:
-            total, before = 0, line[(i - 1) % 3]
+            total, before = np.float32(0.0), line[(i - 1) % 3]
             for j in range(columns):
-                total += min(abs(new[j] - before[j]), most)
+                total += min(abs(new[j] - before[j]), limit)
             steps[i - 1] = total / columns
         if i > 1 and (i - 2) // tall < one.shape[0]:
             first, second = line[(i - 2) % 3], line[(i - 1) % 3]
@@ -243,7 +244,7 @@ def row_differences(image, tall, wide, step, most, one, two, steps):
             if (i - 1) % tall == 0:
                 block = (i - 2) // tall
                 for c in range(one.shape[1]):
-                    of_near, of_far = 0, 0
+                    of_near, of_far = 0.0, 0.0
                     for j in range(c * across, (c + 1) * across):
                         of_near += near[j]
                         of_far += far[j]
@@ -500,7 +501,7 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
 
 @kernel
 def find_dark(image, points, terms, lens, across, search, floor, place, sd):
-    """Place (n,) along unit vectors (n, 2) of dark features at points (n, 3) of the shell, and its sd, over a ``floor``.
+    """Place (n,) of dark features, at points (n, 3) of the shell, along unit vectors (n, 2); its sd, over a ``floor``.
 
     ``terms``, ``lens``: as of `estimators._sight_kernels.project_points`. ``search``: reach, half widths, signs and
     noise, as of `dark_centres`.

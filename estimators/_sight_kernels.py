@@ -111,7 +111,7 @@ def project_points(points, terms, lens, pixels, jacobian):
     radius of the ring about which the shell flattens. ``lens``: model, half field, focal lengths (2), principal point
     (2), coefficients (5), camera position (3) and camera axes (3, 3).
     """
-    rotation, left, joint, flattening, ring_station, ring_radius = terms
+    rotation, left = terms[:2]
     model, half_field, focal, centre, k, position, axes = lens
     by_body = np.empty((2, 3))
     for i in range(len(points)):
