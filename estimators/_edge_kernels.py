@@ -228,14 +228,14 @@ def row_differences(image, tall, wide, step, most, one, two, steps):
     line, limit = np.zeros((3, columns), dtype=np.float32), np.float32(most)
     near, far = np.zeros(columns, dtype=np.float32), np.zeros(columns, dtype=np.float32)
     for i in range(h):
-        new, row = line[i % 3], image[i]
+        new, row = line[i % 3], image[i, ::step]
         for j in range(columns):
-            new[j] = row[j * step]
+            new[j] = row[j]
         if i > 0:
             total, before = np.float32(0.0), line[(i - 1) % 3]
             for j in range(columns):
                 total += min(abs(new[j] - before[j]), limit)
-            steps[i - 1] = total / columns
+            steps[i - 1] = np.float64(total) / columns
         if i > 1 and (i - 2) // tall < one.shape[0]:
             first, second = line[(i - 2) % 3], line[(i - 1) % 3]
             for j in range(used):
@@ -244,7 +244,7 @@ def row_differences(image, tall, wide, step, most, one, two, steps):
             if (i - 1) % tall == 0:
                 block = (i - 2) // tall
                 for c in range(one.shape[1]):
-                    of_near, of_far = 0.0, 0.0
+                    of_near, of_far = np.float64(0.0), np.float64(0.0)
                     for j in range(c * across, (c + 1) * across):
                         of_near += near[j]
                         of_far += far[j]
