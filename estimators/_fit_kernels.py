@@ -72,7 +72,7 @@ def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, co
 
 @inlined
 def _feature_residuals(
-    spots, across, place, feature_offset, waves, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
+    spots, across, place, sd, feature_offset, waves, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
 ):  # fmt: skip
     """As `_edge_residuals` for features, in the rows behind the edge's; those beyond ``outlier`` px become NaN."""
     p = len(spots)
@@ -80,7 +80,7 @@ def _feature_residuals(
     for i in range(p):
         ax, ay = across[i]
         residual[m + i] = place[i] - ax * pixels[i, 0] - ay * pixels[i, 1] - feature_offset[i]
-        if not abs(residual[m + i]) < outlier:
+        if not (abs(residual[m + i]) < outlier and sd[i] < np.inf):
             residual[m + i] = np.nan
         for c in range(COLUMNS):
             rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
@@ -190,10 +190,10 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     ``shell``: clocking angles of the edge, circles whose limb it is (`flightmodel.geometry.edge_circles`), ring about
     which the shell flattens, distance of the outermost torus from it, joint station. ``edge``: points (m, 2), light
     (m, 3), sd and residual at the benchmark (m,), NaN where it was not found. ``features``: points of the shell (p, 3),
-    directions (p, 2), places, sd, residuals there (p,). ``prior``: mean and sd of flattening, joint, lobes (12), light
-    (3). ``limits``: Huber's, largest residual, last step, steps, fewest edge points. ``residual``: against the deformed
-    shell without lobes; ``left``: with what the fit makes of them, of joint and light. Rows with weight zero were not
-    used; edge points come first.
+    directions (p, 2), places, sd, infinite where one was not found, residuals there (p,). ``prior``: mean and sd of
+    flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual, last step, steps, fewest edge
+    points. ``residual``: against the deformed shell without lobes; ``left``: with what the fit makes of them, of joint
+    and light. Rows with weight zero were not used; edge points come first.
     """
     clocks, circles, ring, width, joint = shell
     found, light, edge_sd, edge_offset = edge
@@ -220,8 +220,8 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
                 return TOO_FEW, taken
             _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
         _feature_residuals(
-            spots, across, place, feature_offset, waves, terms, lens, outlier, m, spot_pixels, spot_jacobian, residual,
-            rows, shape,
+            spots, across, place, feature_sd, feature_offset, waves, terms, lens, outlier, m, spot_pixels,
+            spot_jacobian, residual, rows, shape,
         )  # fmt: skip
         _without_shape(residual, rows, shape, form, left)
         edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)

@@ -427,7 +427,7 @@ class OrientedCamera(FrameModel):
         if len(has) < LEAST_FEATURES:
             return None, 0.0, False
         fitted = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2))
-        off = np.abs(fitted.left_px)
+        off = np.abs(fitted.left_px[has])
         agreed = float(np.mean(off < _AGREED_PX))
         if agreed < _LEAST_AGREED:
             turned = _agreed_turned(fitted)

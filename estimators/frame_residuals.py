@@ -95,9 +95,8 @@ def edge_residuals(view: VirtualCamera, horizon: HorizonLine, deformation: Float
 
 def light_columns(view: VirtualCamera, horizon: HorizonLine) -> FloatArray:
     """Shift, tilt and bow of the found edge, ``(n, 3)``; one at the picture's sides, as the shell stands in it."""
-    along, across, half = view.across_picture
-    u, v = horizon.points_px.T
-    side = ((u - half[0]) * along + (v - half[1]) * across) / (abs(along) * half[0] + abs(across) * half[1])
+    per_px, middle = view.across_picture
+    side = horizon.points_px @ per_px - middle
     out = np.empty((len(side), 3))
     out[:, 0], out[:, 1], out[:, 2] = 1.0, side, 1.5 * side**2 - 0.5
     return out

@@ -58,6 +58,7 @@ TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CA
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
 LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
+_NO_FEATURES = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
 SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
 """Flattening and lobes among deflection, flattening, joint station, lobes and light."""
 
@@ -185,10 +186,20 @@ class Solution:
     weight: FloatArray
     feature_rows: NDArray[np.intp]
 
+    @cached_property
+    def by_pose(self) -> FloatArray:
+        """Error (k + 17, 12) per unit error of the camera's pose."""
+        return self.gain @ (self.rows[:, POSED] - self.before[:, POSED])
+
+    @cached_property
+    def by_deflection(self) -> FloatArray:
+        """Missing part (k + 17, 2) per unit deflection of the benchmark frame, the pose aside."""
+        return self.gain @ self.before[:, DEFLECTION]
+
 
 @dataclass(frozen=True)
 class Fitted:
-    """Edge points, which come first, and features at the end of a fit; ``benchmark_at``: their rows there.
+    """Edge points, which come first, and all features at the end of a fit; ``benchmark_at``: their rows there.
 
     ``left_px``: residuals less what the shell's lobes, the joint's station and the light explain.
     """
@@ -347,25 +358,21 @@ class FrameModel:
     ) -> Fitted:  # fmt: skip
         """Fit ``deformation`` (3,) in place to the edge and, where given, the found features."""
         view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
-        has = found_rows(place) if place is not None else np.zeros(0, dtype=np.intp)
         edge_offset, before_sd, edge_at = self._at_benchmark(horizon.line, BESIDE if horizon.is_by_hand else 0)
-        feature_offset, feature_before_sd, feature_at = self._at_benchmark(lines + has)
         edge = (horizon.points_px, light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), edge_offset)
-        spot, sd = (place[0][has], place[1][has]) if place is not None else (np.zeros(0), np.zeros(0))
-        painted = self.features
-        features = (
-            painted.points_shell_m[has],
-            painted.across_px[has],
-            spot,
-            np.hypot(sd, feature_before_sd),
-            feature_offset,
-        )
+        # one that is not found has an infinite sd, and no weight
+        found, features = 0, _NO_FEATURES
+        if place is not None:
+            offset, feature_before_sd, feature_at = (part[lines:] for part in self._every_place_at_benchmark)
+            sd, painted, found = np.hypot(place[1], feature_before_sd), self.features, len(found_rows(place))
+            features = (painted.points_shell_m, painted.across_px, place[0], sd, offset)
+            edge_at = np.concatenate([edge_at, feature_at])
         prior = prior or self._shape_prior(k)
-        count = len(edge_offset) + len(has)
-        residual, left, weight = np.empty(count), np.empty(count), np.empty(count)
+        count = len(edge_at)
+        residual, left, weight = np.empty((3, count))
         rows, shape = np.zeros((count, 16)), np.zeros((count, _fit_kernels.SHAPES))
         least = least_points(horizon)
-        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if len(has) >= LEAST_FEATURES else least)
+        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if found >= LEAST_FEATURES else least)
         state, number = _fit_kernels.fit_frame(
             deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
             limits, residual, rows, shape, weight, left,
@@ -377,7 +384,7 @@ class FrameModel:
             )
         if state == _fit_kernels.DIVERGED:
             raise NoFitError("the fit diverged beyond 28 deg", "fit-diverged")
-        return Fitted(residual, left, rows, shape, weight, np.concatenate([edge_at, feature_at]), len(edge_offset))
+        return Fitted(residual, left, rows, shape, weight, edge_at, len(edge_offset))
 
     def _solve(
         self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
@@ -389,7 +396,7 @@ class FrameModel:
         found = self._fit_points(horizon, place, deformation, basis, prior)
         n, width = len(found.weight), k + len(sd)
         columns, at, rows = np.empty((n, width)), np.empty(n, dtype=np.intp), np.empty((n, found.rows.shape[1]))
-        residual, weight = np.empty(n), np.empty(n)
+        residual, weight = np.empty((2, n))
         count, square = _fit_kernels.used_points(
             np.ascontiguousarray(basis), found.rows, found.shape, found.residual_px, found.left_px, found.weight,
             columns, (at, rows, residual, weight),
@@ -405,13 +412,8 @@ class FrameModel:
             raise NoFitError(
                 f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed", "edge-not-shell"
             )
-        columns, at, rows, residual, weight = (
-            columns[:count],
-            at[:count],
-            rows[:count],
-            residual[:count],
-            weight[:count],
-        )
+        columns, at, rows = columns[:count], at[:count], rows[:count]
+        residual, weight = residual[:count], weight[:count]
         formal, step = np.empty((width, width)), np.empty(width)
         _fit_kernels.solved(columns, residual, weight, prior, float(deformation[2]), formal, step)
         before = self.benchmark_residuals.rows[found.benchmark_at[at]]
@@ -419,9 +421,6 @@ class FrameModel:
         # the flattening's value was carried from step to step, the others are counted from zero in each
         shape_found = step[k:]
         shape_found[0] += deformation[2]
-        features = (
-            np.zeros(0, dtype=np.intp) if place is None else found_rows(place)[at[edge_count:] - found.edge_points]
-        )
         return Solution(
             (formal @ columns.T) * weight,
             formal,
@@ -433,7 +432,7 @@ class FrameModel:
             rms,
             residual,
             weight,
-            features,
+            at[edge_count:] - found.edge_points,
         )
 
     @cached_property
@@ -456,9 +455,8 @@ class FrameModel:
         return step[:2], alone
 
     def _answer(self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray) -> FrameFit:
-        k, before = basis.shape[1], last.before
-        by_camera = last.gain @ (last.rows[:, POSED] - before[:, POSED])
-        by_benchmark = last.gain @ before[:, DEFLECTION] + by_camera @ self.posed_per_deflection
+        k, by_camera = basis.shape[1], last.by_pose
+        by_benchmark = last.by_deflection + by_camera @ self.posed_per_deflection
         features, shape, leak = len(last.feature_rows), None, 0.0
         light = np.sqrt(2.0) * self.apriori.features_px * self._light_shift[last.feature_rows]  # of two frames
         by_light = last.gain[:, last.edge_count :] @ light
@@ -492,16 +490,22 @@ class FrameModel:
 
     def _contradiction(self, difference: FloatArray, edge: Solution, both: Solution) -> float:
         """Chi-square (2) of the difference of two answers, of which one uses a part of the other's points."""
-        posed, missing = (
-            [s.gain[:2] @ (s.rows[:, POSED] - s.before[:, POSED]) for s in (edge, both)],
-            [s.gain[:2] @ s.before[:, DEFLECTION] for s in (edge, both)],
-        )
-        camera = posed[0] - posed[1]
-        rest = (missing[0] - missing[1] + camera @ self.posed_per_deflection) * self.apriori.benchmark_rad
+        camera = edge.by_pose[:2] - both.by_pose[:2]
+        missing = edge.by_deflection[:2] - both.by_deflection[:2]
+        rest = (missing + camera @ self.posed_per_deflection) * self.apriori.benchmark_rad
         covariance = camera @ self.posed_covariance @ camera.T + rest @ rest.T
         # of the best answers, the better one's error has no part in the difference
-        value, axes = np.linalg.eigh((edge.formal - both.formal)[:2, :2])
-        covariance += (axes * np.maximum(value, _LEAST_VAR)) @ axes.T
+        covariance += _at_least((edge.formal - both.formal)[:2, :2], _LEAST_VAR)
         (a, b), (c, d) = covariance.tolist()
         y, z = difference.tolist()
         return (d * y * y - (b + c) * y * z + a * z * z) / (a * d - b * c)
+
+
+def _at_least(matrix: FloatArray, least: float) -> FloatArray:
+    """Symmetric matrix (2, 2) with eigenvalues of no less."""
+    (a, b), (_, d) = matrix.tolist()
+    middle, half = 0.5 * (a + d), float(np.hypot(0.5 * (a - d), b))
+    low, high = max(middle - half, least), max(middle + half, least)
+    # of the middle's own part and of one along the axes
+    share = 0.5 * (high - low) / half if half > 0.0 else 0.0
+    return 0.5 * (high + low) * np.eye(2) + share * (matrix - middle * np.eye(2))

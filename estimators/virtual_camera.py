@@ -115,13 +115,16 @@ class VirtualCamera:
         return self.clocks_rad, self._circles, self._ring, self.width_m, self.joint_station_m
 
     @cached_property
-    def across_picture(self) -> tuple[float, float, tuple[float, float]]:
-        """Unit vector in the picture towards smaller clocking angles, to the right if upright; half its size, px."""
+    def across_picture(self) -> tuple[FloatArray, float]:
+        """Towards smaller clocking angles, to the right if upright: per px (2,), so that the picture's sides are at one
+
+        from its middle, and what that gives for the middle.
+        """
         y, z = self.camera.position_body_m[1:]
         along = self.camera.dcm_cam_body[:2, 1:] @ np.array([-z, y])
-        along /= np.hypot(*along)
-        width, height = self.camera.size_px
-        return float(along[0]), float(along[1]), (0.5 * width, 0.5 * height)
+        half = 0.5 * np.array(self.camera.size_px)
+        per_px = along / (np.abs(along) @ half)
+        return per_px, float(per_px @ half)
 
     @cached_property
     def _circles(self) -> FloatArray:
