@@ -267,14 +267,21 @@ def breaks(steps, beside, over, found):
 
 
 @kernel
-def band_of_lines(origin, inward, outer, inner, low, high):
-    """Smallest and largest coordinates (2,) of lines that reach so far to both sides of their origins (n, 2)."""
-    low[:] = np.inf
-    high[:] = -np.inf
+def band_of_lines(origin, inward, outer, inner, size):
+    """First and one beyond the last pixel, across and down, of what lines in a picture of a size want smoothed.
+
+    They reach so far to both sides of their origins (n, 2); beside them are the pixels between which levels lie, and
+    those at a border to which levels beyond it are brought.
+    """
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for i in range(len(origin)):
         for c in range(2):
             a, b = origin[i, c] - outer * inward[i, c], origin[i, c] + inner * inward[i, c]
             low[c], high[c] = min(low[c], a, b), max(high[c], a, b)
+    left, right = max(math.floor(low[0]) - 4, 0), math.ceil(high[0]) + 5
+    top, bottom = max(math.floor(low[1]) - 4, 0), math.ceil(high[1]) + 5
+    left, top = min(left, size[0] - 4), min(top, size[1] - 4)
+    return left, top, min(max(right, left + 4), size[0]), min(max(bottom, top + 4), size[1])
 
 
 @kernel
@@ -419,7 +426,7 @@ def steps_near(grey, inside, noise, contrast, places, bases, place, along, left,
             good[i] = True
 
 
-@kernel
+@inlined
 def square_of_model(left, good, noise, beside, square):
     """Mean square (n,) of what step and ramp leave (n, m), of the mean over a line and ``beside`` on either side.
 
@@ -442,6 +449,29 @@ def square_of_model(left, good, noise, beside, square):
             for k in range(m):
                 mean += (total[k] * per) ** 2
             square[i] = max(mean / m - noise * noise * per, 0.0)
+
+
+@kernel
+def good_steps(lines, steps, noise, weights, beside, floor, found):
+    """Move the points (n, 2) at good steps on lines, their directions, sd and indices to the front; their number.
+
+    ``lines``: origins, directions, indices. ``steps``: as of `steps_near`. ``weights``: samples that err together, of
+    noise and of what step and ramp leave; see `square_of_model`.
+    """
+    origin, inward, index = lines
+    place, along, left, good = steps
+    points, across, sd, line = found
+    square, count = np.empty(len(left)), 0
+    square_of_model(left, good, noise, beside, square)
+    for i in range(len(left)):
+        if good[i]:
+            for c in range(2):
+                points[count, c] = origin[i, c] + place[i] * inward[i, c]
+                across[count, c] = inward[i, c]
+            variance = along[i] * along[i] * (weights[0] * noise * noise + weights[1] * square[i])
+            sd[count], line[count] = math.sqrt(variance + floor * floor), index[i]
+            count += 1
+    return count
 
 
 @inlined

@@ -64,7 +64,7 @@ class BodyEdge:
         moved = moved[seen]
         if len(moved) < _LEAST_POINTS:
             return float("nan"), False
-        same = float(np.mean(np.abs(moved) < _SAME_PX))
+        same = np.count_nonzero(np.abs(moved) < _SAME_PX) / len(moved)
         if same < _LEAST_SAME:
             return float(np.median(np.abs(moved))), True
         if same < _MOST_SAME:

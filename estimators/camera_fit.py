@@ -205,7 +205,7 @@ class OrientedCamera(FrameModel):
             self._check_explained(both)
             return both
         except NoFitError as fault:
-            most = max(USUAL_SHARE * int((~self._benchmark_edge).sum()), LEAST_FEATURES)
+            most = max(USUAL_SHARE * self._benchmark_counts[1], LEAST_FEATURES)
             if fault.codes != ("edge-not-shell",) or place is None or not len(found_rows(place)) > most:
                 raise
         alone = self._solve(_NOTHING, place, deformation, np.eye(2), USUAL_RMS_PX)
@@ -226,7 +226,7 @@ class OrientedCamera(FrameModel):
 
     def _check_seen(self, horizon: HorizonLine, last: Solution) -> None:
         """Refuse a frame of which little is seen: what there is may agree by chance."""
-        of_features = (len(last.rows) - last.edge_count) / max(int((~self._benchmark_edge).sum()), 1)
+        of_features = (len(last.rows) - last.edge_count) / max(self._benchmark_counts[1], 1)
         of_edge = self._edge_share(len(horizon.points_px))
         wanted = _EDGE_BESIDE if of_features < _HARDLY_FEATURES else _LITTLE_SEEN
         if max(of_edge, of_features) < wanted:
@@ -239,8 +239,7 @@ class OrientedCamera(FrameModel):
     def _doubled(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> float:
         """Share of edge points that agree on a second edge; a frame that shows one is refused, by `estimators.edge`."""
         rows = self.view.mismatch(horizon, self.view.edge(deformation))[1]
-        seen = np.asarray(np.isfinite(rows).all(axis=1))
-        share, fault = second_edge(frame.kept, horizon.some(seen), rows[seen, DEFLECTION], rows[seen, RADIUS])
+        share, fault = second_edge(frame.kept, horizon, rows[:, DEFLECTION], rows[:, RADIUS])
         if fault:
             raise NoFitError(fault)
         return share
@@ -447,7 +446,7 @@ class OrientedCamera(FrameModel):
         From where the search starts, if most features are found there; else from where the edge is found or where the
         feature map fits, whichever shows most: behind the rim may be the Earth, whose limb is an edge too.
         """
-        wanted = _FEW_FEATURES * int((~self._benchmark_edge).sum())
+        wanted = _FEW_FEATURES * self._benchmark_counts[1]
         guesses = [deformation.copy()]
         found = [frame.features(self.features, self.view, deformation, REACH_PX)]
         trouble = NO_FAULT

@@ -31,7 +31,6 @@ Assumed there: the two are apart by more than an edge's blur, and the weaker one
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -274,16 +273,15 @@ def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
     # the noise, from samples so far apart that smoothing did not correlate them
     spread = _edge_kernels.middle_of_sizes(grey[:, 6:7] - grey[:, :1], _BINS)
     noise = max(spread / (0.6745 * np.sqrt(2.0)), 0.3)
-    place, along, left, good = np.zeros(n), np.zeros(n), np.zeros_like(grey), np.zeros(n, dtype=np.bool_)
-    _edge_kernels.steps_near(
-        grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, place, along, left, good
-    )  # fmt: skip
+    steps = np.empty(n), np.empty(n), np.empty_like(grey), np.empty(n, dtype=np.bool_)
+    _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, *steps)
     # clouds and shades are on neighbouring lines alike, noise differs
-    square = np.empty(n)
-    _edge_kernels.square_of_model(left, good, noise, _NEIGHBOURS, square)
-    sd = along * np.sqrt(_NOISE_TOGETHER * noise**2 + _MODEL_TOGETHER * square)
-    points = near.origin_px + place[:, None] * near.inward_px
-    return HorizonLine(points[good], near.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), near.index[good])
+    points, across, sd, line = np.empty((n, 2)), np.empty((n, 2)), np.empty(n), np.empty(n, dtype=np.intp)
+    count = _edge_kernels.good_steps(
+        (near.origin_px, near.inward_px, near.index), steps, noise, (_NOISE_TOGETHER, _MODEL_TOGETHER), _NEIGHBOURS,
+        _SD_FLOOR_PX, (points, across, sd, line),
+    )  # fmt: skip
+    return HorizonLine(points[:count], across[:count], sd[:count], line[:count])
 
 
 def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
@@ -323,7 +321,7 @@ class KeptPicture:
         _edge_kernels.row_differences(self.image, *_BLOCK_PX, _BLOCK_STEP_PX, _BREAK_MOST, one, two, steps)
         return one, two, steps
 
-    def band(self, span: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], FloatArray]:
+    def band(self, span: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], tuple[float, float]]:
         """Smoothed levels from the pixel ``span[:2]`` up to ``span[2:]``, or of more, and which pixel comes first."""
         left, top, right, bottom = self._span
         if span[0] < left or span[1] < top or span[2] > right or span[3] > bottom:
@@ -333,7 +331,7 @@ class KeptPicture:
             self._span = (left, top, right, bottom)
             band = self.image[top:bottom, left:right]
             self._kept = np.asarray(cv2.sepFilter2D(band, cv2.CV_32F, _SMOOTHING, _SMOOTHING))
-        return self._kept, np.array([left, top], dtype=float)
+        return self._kept, (float(left), float(top))
 
 
 def kept_picture(image: Image | KeptPicture) -> KeptPicture:
@@ -352,18 +350,14 @@ def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[F
     return grey, inside
 
 
-def smoothed_about(picture: KeptPicture, lines: ScanLines) -> tuple[NDArray[np.float32], FloatArray, FloatArray]:
+def smoothed_about(
+    picture: KeptPicture, lines: ScanLines
+) -> tuple[NDArray[np.float32], tuple[float, float], tuple[float, float]]:
     """Smoothed grey levels of at least what lines cross, the pixel that comes first, the picture's width and height."""
     h, w = picture.image.shape
-    first, last = np.empty(2), np.empty(2)
-    _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, first, last)
     # only the band that the lines cross is smoothed
-    left, top = (min(max(math.floor(x) - 4, 0), most - 4) for x, most in zip(first.tolist(), (w, h), strict=True))
-    right, bottom = (
-        min(max(math.ceil(x) + 5, least + 4), most)
-        for x, least, most in zip(last.tolist(), (left, top), (w, h), strict=True)
-    )
-    return *picture.band((left, top, right, bottom)), np.array([w, h], dtype=float)
+    span = _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, (w, h))
+    return *picture.band(span), (float(w), float(h))
 
 
 def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:
@@ -423,12 +417,13 @@ def second_edge(
     by_radius : (n,) float
         The same by the shell's radius, px/m.
     """
-    some = np.arange(len(by_turn)) % max(1, len(by_turn) // _ENOUGH_POINTS) == 0
-    if some.sum() < _LEAST_POINTS:
+    some = slice(None, None, max(1, len(by_turn) // _ENOUGH_POINTS))
+    by_turn, by_radius = by_turn[some], by_radius[some]
+    if len(by_turn) < _LEAST_POINTS:
         return 0.0, NO_FAULT
-    horizon, by_turn, by_radius = horizon.some(some), by_turn[some], by_radius[some]
     reach = _FARTHEST_PX + 1.0
-    lines = ScanLines(horizon.points_px, horizon.inward_px, reach, reach, horizon.line)
+    points, inward = np.ascontiguousarray(horizon.points_px[some]), np.ascontiguousarray(horizon.inward_px[some])
+    lines = ScanLines(points, inward, reach, reach, horizon.line[some])
     grey, inside = sampled(image, lines, round(2.0 * reach / STEP_PX) + 1)
     rise, first = np.empty((len(grey), grey.shape[1] - 2)), np.empty(len(grey))
     _edge_kernels.rises_over_pixel(grey, round(1.0 / STEP_PX), rise, first)

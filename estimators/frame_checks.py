@@ -18,6 +18,7 @@ Assumed: the camera is fixed to the centerbody, its lens too. Edge points alone 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class Design:
     weight: FloatArray
     edge_points: int
 
-    @property
+    @cached_property
     def places(self) -> tuple[FloatArray, FloatArray]:
         """Right and down (n,) from the picture's centre, over the focal length."""
         # roll about the line of sight moves a point p by its normal, the focal scale by p itself

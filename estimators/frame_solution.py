@@ -58,7 +58,7 @@ TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CA
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
 LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
-_NO_FEATURES = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+_NO_FEATURES: tuple[FloatArray, ...] = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
 SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
 """Flattening and lobes among deflection, flattening, joint station, lobes and light."""
 
@@ -294,14 +294,20 @@ class FrameModel:
         """Which of the points found in the benchmark frame are the edge's, the others are features."""
         return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
 
+    @cached_property
+    def _benchmark_counts(self) -> tuple[int, int]:
+        """Edge points and features found in the benchmark frame."""
+        edge = int(self._benchmark_edge.sum())
+        return edge, len(self._benchmark_edge) - edge
+
     @property
     def edge_in_view(self) -> float:
         """Share of the edge looked for that the benchmark frame shows."""
-        return float(self._benchmark_edge.sum()) / max(len(self.clocks_rad), 1)
+        return self._benchmark_counts[0] / max(len(self.clocks_rad), 1)
 
     def _edge_share(self, points: int) -> float:
         """So many edge points over those of the benchmark frame; none where that shows no edge."""
-        there = int(self._benchmark_edge.sum())
+        there = self._benchmark_counts[0]
         return points / there if there else 0.0
 
     def _at_benchmark(
@@ -482,7 +488,7 @@ class FrameModel:
         rest = by_benchmark * self.apriori.benchmark_rad
         return np.asarray(formal + by_camera @ self.posed_covariance @ by_camera.T + rest @ rest.T)
 
-    @property
+    @cached_property
     def _edge_rms_px(self) -> float:
         """Of the edge in the benchmark frame."""
         edge = self.benchmark_residuals.residual_px[self._benchmark_edge]
