@@ -20,6 +20,10 @@ SHAPES = LOBES + 3  # light
 _RADIUS = COLUMNS - 2
 _AT_ONCE, _WIDE = 4, 2 + 2 + SHAPES + 1  # points; deflection, flattening, joint, shapes and a residual
 DONE, TOO_FEW, DIVERGED = 0, 1, 2
+_MOTIONS = 12  # terms of a motion at most, as of a warp
+_BESIDE = _WIDE + _MOTIONS + _AT_ONCE  # columns of a fit, of a motion, a residual
+_ROUNDING = float(np.finfo(float).eps)
+_SWEEPS = 30  # a bound: the angles fall as their squares
 
 
 @inlined
@@ -302,3 +306,100 @@ def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
             total += weight[i]
             count += 1
     return count, square / total if total > 0.0 else 0.0
+
+
+@inlined
+def turned_to_axes(matrix, axes):
+    """Turn a symmetric matrix (m, m) to its axes, the columns of ``axes``, in place (C. G. J. Jacobi, 1846)."""
+    m = len(matrix)
+    axes[:] = 0.0
+    for a in range(m):
+        axes[a, a] = 1.0
+    for _ in range(_SWEEPS):
+        is_diagonal = True
+        for a in range(m):
+            for b in range(a + 1, m):
+                off = matrix[a, b]
+                if off * off <= 1e-32 * abs(matrix[a, a] * matrix[b, b]):
+                    continue
+                is_diagonal = False
+                half = 0.5 * (matrix[b, b] - matrix[a, a]) / off
+                t = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for j in range(m):
+                    x, y = matrix[a, j], matrix[b, j]
+                    matrix[a, j], matrix[b, j] = c * x - s * y, s * x + c * y
+                for j in range(m):
+                    x, y = matrix[j, a], matrix[j, b]
+                    matrix[j, a], matrix[j, b] = c * x - s * y, s * x + c * y
+                    x, y = axes[j, a], axes[j, b]
+                    axes[j, a], axes[j, b] = c * x - s * y, s * x + c * y
+                matrix[a, b] = matrix[b, a] = 0.0
+        if is_diagonal:
+            break
+
+
+@inlined
+def _products_beside(columns, by, residual, weight, product):
+    """Weighted products of a motion's columns (n, m) and residuals with the fit's (n, k), themselves and residuals."""
+    (n, k), m = columns.shape, by.shape[1]
+    few, weights = np.zeros((_AT_ONCE, _BESIDE)), np.zeros(_AT_ONCE)
+    for first in range(0, n, _AT_ONCE):
+        for held in range(_AT_ONCE):
+            i = first + held
+            weights[held] = 0.0
+            if i < n:
+                weights[held] = weight[i]
+                for c in range(k):
+                    few[held, c] = columns[i, c]
+                for c in range(m):
+                    few[held, _WIDE + c] = by[i, c]
+                few[held, _WIDE + m] = residual[i]
+        for a in range(m + 1):
+            w0, w1 = weights[0] * few[0, _WIDE + a], weights[1] * few[1, _WIDE + a]
+            w2, w3 = weights[2] * few[2, _WIDE + a], weights[3] * few[3, _WIDE + a]
+            for b in range(_BESIDE):
+                product[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+
+
+@kernel
+def motion_beside(columns, formal, by, residual, weight, allowed, motion):
+    """Motion (m,) beside a fit that explains the residuals best, and its chi-square; see `estimators.frame_checks`.
+
+    ``columns`` (n, k), ``formal`` (k, k): the fit's. ``by`` (n, m): derivatives by the motion. ``allowed``: sd of each
+    of its terms.
+    """
+    k, m = columns.shape[1], by.shape[1]
+    product = np.zeros((m + 1, _BESIDE))
+    _products_beside(columns, by, residual, weight, product)
+    inverse, axes, right = np.empty((m, m)), np.empty((m, m)), np.empty(m)
+    fitted = np.empty(k)
+    for c in range(m + 1):
+        for a in range(k):
+            fitted[a] = 0.0
+            for b in range(k):
+                fitted[a] += formal[a, b] * product[c, b]
+        for j in range(m):
+            left = product[j, _WIDE + c]
+            for a in range(k):
+                left -= product[j, a] * fitted[a]
+            if c < m:
+                inverse[j, c] = left
+            else:
+                right[j] = left
+    turned_to_axes(inverse, axes)
+    motion[:] = 0.0
+    most, square = 0.0, 0.0
+    for q in range(m):
+        most = max(most, inverse[q, q])
+    for q in range(m):
+        value, along = inverse[q, q], 0.0
+        # along the axes of the inverse covariance, where it says anything
+        if value > m * _ROUNDING * most:
+            for j in range(m):
+                along += axes[j, q] * right[j]
+            for j in range(m):
+                motion[j] += axes[j, q] * along / value
+            square += along * along / (value * (1.0 + allowed * allowed * value))
+    return square

@@ -216,7 +216,7 @@ class OrientedCamera(FrameModel):
         """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
         rows, focal = last.rows, float(self.view.camera.focal_px[0])
         design = Design(
-            last.columns, last.gain, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight,
+            last.columns, last.formal, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight,
             last.edge_count,
         )  # fmt: skip
         shape = last.shape_found / self._shape_sd

@@ -22,6 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
+from estimators import _fit_kernels
 from estimators.edge import NO_FAULT
 from flightmodel.checks import Fault, FloatArray
 
@@ -42,8 +43,8 @@ class Design:
     ----------
     columns : (n, 19) float
         Derivatives by deflection (2), flattening, joint station, lobes (12) and light (3).
-    gain : (19, n) float
-        The fit's, with the priors.
+    formal : (19, 19) float
+        The fit's covariance, with the priors.
     turn : (n, 4) float
         By the scene's rotation in camera axes, rad, and the focal scale, px.
     across : (n, 2) float
@@ -55,7 +56,7 @@ class Design:
     """
 
     columns: FloatArray
-    gain: FloatArray
+    formal: FloatArray
     turn: FloatArray
     across: FloatArray
     focal_px: float
@@ -89,14 +90,11 @@ class Design:
 
         ``allowed``: sd that unmodelled lobes lend to each of its terms.
         """
-        turned = by.T * self.weight
-        crossed, fitted = turned @ self.columns, self.gain @ self.residual_px
-        inverse, right = turned @ by - crossed @ (self.gain @ by), turned @ self.residual_px - crossed @ fitted
-        # along the axes of the inverse covariance, where it says anything
-        value, axes = np.linalg.eigh(inverse)
-        along, known = axes.T @ right, value > len(value) * np.finfo(float).eps * value[-1]
-        along, value = along[known], value[known]
-        return axes[:, known] @ (along / value), float(np.sum(along**2 / (value * (1.0 + allowed**2 * value))))
+        motion = np.empty(by.shape[1])
+        square = _fit_kernels.motion_beside(
+            self.columns, self.formal, np.ascontiguousarray(by), self.residual_px, self.weight, allowed, motion
+        )  # fmt: skip
+        return motion, square
 
 
 def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> Fault:

@@ -369,10 +369,10 @@ class FrameModel:
         # one that is not found has an infinite sd, and no weight
         found, features = 0, _NO_FEATURES
         if place is not None:
-            offset, feature_before_sd, feature_at = (part[lines:] for part in self._every_place_at_benchmark)
-            sd, painted, found = np.hypot(place[1], feature_before_sd), self.features, len(found_rows(place))
-            features = (painted.points_shell_m, painted.across_px, place[0], sd, offset)
-            edge_at = np.concatenate([edge_at, feature_at])
+            there, before_sd, at = self._every_place_at_benchmark
+            sd, painted, found = np.hypot(place[1], before_sd[lines:]), self.features, len(found_rows(place))
+            features = (painted.points_shell_m, painted.across_px, place[0], sd, there[lines:])
+            edge_at = np.concatenate([edge_at, at[lines:]])
         prior = prior or self._shape_prior(k)
         count = len(edge_at)
         residual, left, weight = np.empty((3, count))

@@ -24,7 +24,7 @@ from estimators.virtual_camera import VirtualCamera
 from flightmodel import _raster_kernels
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_direction
-from tests.oracles import plain_horizon, plain_sight
+from tests.oracles import plain_fit, plain_horizon, plain_sight
 
 from .conftest import VEHICLE
 
@@ -479,6 +479,23 @@ def test_the_fit_is_the_most_probable_one():
     best = least_squares(residuals, np.concatenate([got, np.zeros(16)]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     assert abs(best[2] - true[2]) > 1e-5  # the priors pull
     np.testing.assert_allclose(got, best[:3], atol=2e-6)
+
+
+@pytest.mark.parametrize("terms", [1, 4, 12])
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
+    """Of columns as unlike as radians and pixels; and where one term of the motion moves no point."""
+    rng = np.random.default_rng(terms)
+    columns, by = rng.normal(size=(61, 19)), rng.normal(size=(61, terms)) * 300.0 ** rng.random(terms)
+    by[:, -1] *= is_seen
+    residual, weight = rng.normal(size=61), rng.random(61)
+    formal = np.linalg.inv((columns.T * weight) @ columns + np.diag(rng.random(19)))
+    motion = np.empty(terms)
+    square = _fit_kernels.motion_beside(columns, formal, by, residual, weight, 0.02, motion)
+    expected, expected_square = plain_fit.motion_beside(columns, formal, by, residual, weight, 0.02)
+    np.testing.assert_allclose(motion, expected, rtol=1e-7, atol=1e-12)
+    assert square == pytest.approx(expected_square, rel=1e-8, abs=1e-12)
+    assert (square > 0.0) == (is_seen or terms > 1)
 
 
 def test_large_residuals_pull_no_harder_than_huber_lets_them():

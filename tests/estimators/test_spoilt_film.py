@@ -118,10 +118,10 @@ def sound_design(theta_deg):
     across, pixels = features.across_px[seen], sight.pixels[seen]
     rows = np.einsum("ni,nij->nj", across, sight.jacobian[seen])
     rng = np.random.default_rng(4)
-    columns, weight = rows[:, :2], np.full(len(rows), 25.0)
-    gain = np.linalg.solve((columns.T * weight) @ columns, columns.T * weight)
+    columns, weight = rows[:, :2].copy(), np.full(len(rows), 25.0)
+    formal = np.linalg.inv((columns.T * weight) @ columns)
     residual = 0.2 * rng.standard_normal(len(rows))
-    design = Design(columns, gain, rows[:, TURN], across, float(view.camera.focal_px[0]), residual, weight, 0)
+    design = Design(columns, formal, rows[:, TURN], across, float(view.camera.focal_px[0]), residual, weight, 0)
     return design, (pixels - view.camera.centre_px) / view.camera.focal_px
 
 
