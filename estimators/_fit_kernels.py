@@ -18,10 +18,7 @@ JOINT = COLUMNS - 1
 LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
 SHAPES = LOBES + 3  # light
 _RADIUS = COLUMNS - 2
-_AT_ONCE, _WIDE = 4, 2 + 2 + SHAPES + 1  # points; deflection, flattening, joint, shapes and a residual
 DONE, TOO_FEW, DIVERGED = 0, 1, 2
-_MOTIONS = 12  # terms of a motion at most, as of a warp
-_BESIDE = _WIDE + _MOTIONS + _AT_ONCE  # columns of a fit, of a motion, a residual
 _ROUNDING = float(np.finfo(float).eps)
 _SWEEPS = 30  # a bound: the angles fall as their squares
 
@@ -135,15 +132,19 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 
 @inlined
-def _add_points(few, weights, normal):
-    """Add weighted products of points' columns (4, 20) to the lower half of normal equations (20, 20)."""
-    for block in range(_WIDE // _AT_ONCE):
-        for c in range(_AT_ONCE):
-            a = _AT_ONCE * block + c
-            w0, w1 = weights[0] * few[0, a], weights[1] * few[1, a]
-            w2, w3 = weights[2] * few[2, a], weights[3] * few[3, a]
-            for b in range(_AT_ONCE * (block + 1)):
-                normal[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
+def _lower_products(columns, count, weight, first, weighted, product):
+    """Weighted products of points' columns, one a row (q, n), with those up to themselves, from the ``first`` row on.
+
+    ``weighted`` (n,): room for one. Sums along rows run in vector registers.
+    """
+    for a in range(first, len(columns)):
+        for i in range(count):
+            weighted[i] = weight[i] * columns[a, i]
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(count):
+                total += weighted[i] * columns[b, i]
+            product[a, b] = total
 
 
 @inlined
@@ -151,7 +152,7 @@ def _add_prior(prior, flattening, k, normal, right):
     """Take the right side (n,) out of the last row, and add means and sd on all but ``k`` of a deflection."""
     mean, sd = prior
     for a in range(len(right)):
-        right[a] = normal[_WIDE - 1, a]
+        right[a] = normal[len(right), a]
         if a >= k:
             normal[a, a] += 1.0 / sd[a - k] ** 2
             right[a] += mean[a - k] / sd[a - k] ** 2
@@ -160,30 +161,25 @@ def _add_prior(prior, flattening, k, normal, right):
 
 
 @inlined
-def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, few, normal, right):
+def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, room, normal, right):
     """Weighted normal equations with priors, means and sd, on all but the deflection.
 
-    ``few`` (4, 20): designs of as many points at once, each with its residual behind, and ``normal`` (20, 20) alike.
+    ``room``: designs (k + 18, n) of points, their residuals behind; twice as many weights. ``normal`` as wide.
     """
     k = basis.shape[1]
-    normal[:] = 0.0
-    few[:] = 0.0
-    weights, held = np.zeros(_AT_ONCE), 0
-    for i in range(len(residual) + 1):
-        is_last = i == len(residual)
-        if not is_last and weight[i] > 0.0:
+    columns, used, weighted = room
+    count = 0
+    for i in range(len(residual)):
+        if weight[i] > 0.0:
             for j in range(k):
-                few[held, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
-            few[held, k], few[held, k + 1] = rows[i, 2], rows[i, JOINT]
+                columns[j, count] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[k, count], columns[k + 1, count] = rows[i, 2], rows[i, JOINT]
             for j in range(SHAPES):
-                few[held, k + 2 + j] = shape[i, j]
-            few[held, _WIDE - 1] = residual[i]
-            weights[held] = weight[i]
-            held += 1
-        if held == _AT_ONCE or is_last:
-            _add_points(few, weights, normal)
-            weights[:] = 0.0
-            held = 0
+                columns[k + 2 + j, count] = shape[i, j]
+            columns[k + 2 + SHAPES, count] = residual[i]
+            used[count] = weight[i]
+            count += 1
+    _lower_products(columns, count, used, 0, weighted, normal)
     _add_prior(prior, flattening, k, normal, right)
 
 
@@ -210,7 +206,8 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     kept, at = np.empty(len(clocks)), np.empty(m)
     rotation, columns = np.empty((3, 3)), np.empty((3, 2))
     scaled = np.empty(max(m, p))
-    few, normal, right = np.empty((_AT_ONCE, _WIDE)), np.empty((_WIDE, _WIDE)), np.empty(n)
+    room = np.empty((n + 1, m + p)), np.empty(m + p), np.empty(m + p)
+    normal, right = np.empty((n + 1, n + 1)), np.empty(n)
     waves = np.empty((p, LOBES))
     _waves_of_spots(spots, ring, waves)
     form = np.zeros(1 + SHAPES)
@@ -231,7 +228,7 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
         edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)
         if edges < fewest:
             return TOO_FEW, edges
-        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, few, normal, right)
+        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, room, normal, right)
         small_cholesky(normal, len(right), normal)
         small_solve(normal, len(right), right)
         step = right
@@ -259,17 +256,9 @@ def solved(columns, residual, weight, prior, flattening, formal, found):
     the deflection, the flattening's about ``flattening``, which comes on top of the step.
     """
     m, n = columns.shape
-    few, normal, weights = np.zeros((_AT_ONCE, _WIDE)), np.zeros((_WIDE, _WIDE)), np.zeros(_AT_ONCE)
-    for first in range(0, m, _AT_ONCE):
-        for held in range(_AT_ONCE):
-            i = first + held
-            weights[held] = 0.0
-            if i < m:
-                weights[held] = weight[i]
-                for a in range(n):
-                    few[held, a] = columns[i, a]
-                few[held, _WIDE - 1] = residual[i]
-        _add_points(few, weights, normal)
+    turned, normal = np.empty((n + 1, m)), np.empty((n + 1, n + 1))
+    turned[:n], turned[n] = columns.T, residual
+    _lower_products(turned, m, weight, 0, np.empty(m), normal)
     _add_prior(prior, flattening, n - len(prior[0]), normal, found)
     small_cholesky(normal, n, normal)
     small_solve(normal, n, found)
@@ -340,29 +329,6 @@ def turned_to_axes(matrix, axes):
             break
 
 
-@inlined
-def _products_beside(columns, by, residual, weight, product):
-    """Weighted products of a motion's columns (n, m) and residuals with the fit's (n, k), themselves and residuals."""
-    (n, k), m = columns.shape, by.shape[1]
-    few, weights = np.zeros((_AT_ONCE, _BESIDE)), np.zeros(_AT_ONCE)
-    for first in range(0, n, _AT_ONCE):
-        for held in range(_AT_ONCE):
-            i = first + held
-            weights[held] = 0.0
-            if i < n:
-                weights[held] = weight[i]
-                for c in range(k):
-                    few[held, c] = columns[i, c]
-                for c in range(m):
-                    few[held, _WIDE + c] = by[i, c]
-                few[held, _WIDE + m] = residual[i]
-        for a in range(m + 1):
-            w0, w1 = weights[0] * few[0, _WIDE + a], weights[1] * few[1, _WIDE + a]
-            w2, w3 = weights[2] * few[2, _WIDE + a], weights[3] * few[3, _WIDE + a]
-            for b in range(_BESIDE):
-                product[a, b] += w0 * few[0, b] + w1 * few[1, b] + w2 * few[2, b] + w3 * few[3, b]
-
-
 @kernel
 def motion_beside(columns, formal, by, residual, weight, allowed, motion):
     """Motion (m,) beside a fit that explains the residuals best, and its chi-square; see `estimators.frame_checks`.
@@ -370,22 +336,23 @@ def motion_beside(columns, formal, by, residual, weight, allowed, motion):
     ``columns`` (n, k), ``formal`` (k, k): the fit's. ``by`` (n, m): derivatives by the motion. ``allowed``: sd of each
     of its terms.
     """
-    k, m = columns.shape[1], by.shape[1]
-    product = np.zeros((m + 1, _BESIDE))
-    _products_beside(columns, by, residual, weight, product)
+    (n, k), m = columns.shape, by.shape[1]
+    turned, product = np.empty((k + m + 1, n)), np.empty((k + m + 1, k + m + 1))
+    turned[:k], turned[k : k + m], turned[k + m] = columns.T, by.T, residual
+    _lower_products(turned, n, weight, k, np.empty(n), product)
     inverse, axes, right = np.empty((m, m)), np.empty((m, m)), np.empty(m)
     fitted = np.empty(k)
     for c in range(m + 1):
         for a in range(k):
             fitted[a] = 0.0
             for b in range(k):
-                fitted[a] += formal[a, b] * product[c, b]
-        for j in range(m):
-            left = product[j, _WIDE + c]
+                fitted[a] += formal[a, b] * product[k + c, b]
+        for j in range(min(c + 1, m)):
+            left = product[k + c, k + j]
             for a in range(k):
-                left -= product[j, a] * fitted[a]
+                left -= product[k + j, a] * fitted[a]
             if c < m:
-                inverse[j, c] = left
+                inverse[c, j] = inverse[j, c] = left
             else:
                 right[j] = left
     turned_to_axes(inverse, axes)
