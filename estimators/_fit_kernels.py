@@ -48,15 +48,6 @@ def _lobe_columns(flattening, outwards, waves, shape):
 
 
 @inlined
-def _waves_of_spots(spots, ring, waves):
-    """Waves (p, 12) round the shell at features (p, 3)."""
-    for i in range(len(spots)):
-        radius = math.sqrt(spots[i, 1] ** 2 + spots[i, 2] ** 2)
-        away = math.sqrt((-spots[i, 0] - ring[0]) ** 2 + (radius - ring[1]) ** 2)
-        _waves_round(math.atan2(spots[i, 2], -spots[i, 1]), away, waves[i])
-
-
-@inlined
 def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at):
     """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
     m, waves = len(found), np.empty(LOBES)
@@ -190,14 +181,14 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     ``shell``: clocking angles of the edge, circles whose limb it is (`flightmodel.geometry.edge_circles`), ring about
     which the shell flattens, distance of the outermost torus from it, joint station. ``edge``: points (m, 2), light
     (m, 3), sd and residual at the benchmark (m,), NaN where it was not found. ``features``: points of the shell (p, 3),
-    directions (p, 2), places, sd, infinite where one was not found, residuals there (p,). ``prior``: mean and sd of
-    flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual, last step, steps, fewest edge
-    points. ``residual``: against the deformed shell without lobes; ``left``: with what the fit makes of them, of joint
-    and light. Rows with weight zero were not used; edge points come first.
+    directions (p, 2), places, sd, infinite where one was not found, residuals there (p,), waves round the shell there
+    (p, 12). ``prior``: mean and sd of flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual,
+    last step, steps, fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what
+    the fit makes of them, of joint and light. Rows with weight zero were not used; edge points come first.
     """
     clocks, circles, ring, width, joint = shell
     found, light, edge_sd, edge_offset = edge
-    spots, across, place, feature_sd, feature_offset = features
+    spots, across, place, feature_sd, feature_offset, waves = features
     m, p, k = len(found), len(spots), basis.shape[1]
     n = k + 2 + SHAPES
     points, pixels = np.empty((len(clocks), 3)), np.empty((len(clocks), 2))
@@ -208,8 +199,6 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
     scaled = np.empty(max(m, p))
     room = np.empty((n + 1, m + p)), np.empty(m + p), np.empty(m + p)
     normal, right = np.empty((n + 1, n + 1)), np.empty(n)
-    waves = np.empty((p, LOBES))
-    _waves_of_spots(spots, ring, waves)
     form = np.zeros(1 + SHAPES)
     huber, outlier, last_step, steps, fewest = limits
     for taken in range(steps):

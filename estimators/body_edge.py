@@ -103,10 +103,10 @@ def _lines(view: VirtualCamera) -> ScanLines | None:
     # in order along the silhouette, from where the picture's border cuts it
     gap = np.diff(kept, append=kept[0] + len(x))
     kept = np.roll(kept, -int(np.argmax(gap)) - 1)[::_EVERY_PX]
-    slope = np.gradient(cv2.GaussianBlur(shade.astype(float), (0, 0), 3.0))
-    out = -np.column_stack([slope[1][y[kept], x[kept]], slope[0][y[kept], x[kept]]])
+    soft, (u, v) = cv2.GaussianBlur(shade.astype(float), (0, 0), 3.0), (x[kept], y[kept])
+    out = np.column_stack([soft[v, u - 1] - soft[v, u + 1], soft[v - 1, u] - soft[v + 1, u]])
     out /= np.maximum(np.linalg.norm(out, axis=1), 1e-12)[:, None]
-    return ScanLines(np.column_stack([x, y])[kept].astype(float), out, _REACH_PX, _REACH_PX, np.arange(len(kept)))
+    return ScanLines(np.column_stack([u, v]).astype(float), out, _REACH_PX, _REACH_PX, np.arange(len(kept)))
 
 
 def _places(picture: KeptPicture, lines: ScanLines) -> FloatArray:

@@ -107,11 +107,17 @@ def lobe_columns(rows: FloatArray, away_m: FloatArray, clocks_rad: FloatArray) -
 
     ``away_m``: distance from the innermost ring.
     """
+    waves, across = waves_round(clocks_rad, away_m), 2 * len(WAVES)
+    return np.hstack([rows[:, [FLATTENING]] * waves[:, :across], rows[:, [RADIUS]] * waves[:, across:]])
+
+
+def waves_round(clocks_rad: FloatArray, away_m: FloatArray) -> FloatArray:
+    """Cosine and sine of each wave across the shell (n, 8), and times ``away_m`` of those along its radius (n, 4)."""
     across, along = (
         np.stack([wave(n * clocks_rad) for n in waves for wave in (np.cos, np.sin)], axis=1)
         for waves in (WAVES, ROUND_WAVES)
     )
-    return np.hstack([rows[:, [FLATTENING]] * across, (away_m * rows[:, RADIUS])[:, None] * along])
+    return np.hstack([across, away_m[:, None] * along])
 
 
 def feature_residuals(

@@ -42,9 +42,10 @@ from estimators.edge import NO_FAULT, HorizonLine, ScanLines
 from estimators.features import Features, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS
-from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns
+from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.deflection import lv_clock
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
 LAST_STEP_RAD = 2e-5  # 0.001 deg, far below any frame's sd
@@ -58,9 +59,10 @@ TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CA
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
 LOBES = slice(2, 2 + _fit_kernels.LOBES)
 """Among flattening, joint station, lobes and light."""
-_NO_FEATURES: tuple[FloatArray, ...] = (np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
+_NO_FEATURES: tuple[FloatArray, ...] = (*(np.zeros((0, k)) for k in (3, 2)), *np.zeros((3, 0)), np.zeros((0, 12)))
 SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
 """Flattening and lobes among deflection, flattening, joint station, lobes and light."""
+_ANSWERED = np.array([0, 1, *SHAPE])
 
 
 @dataclass(frozen=True)
@@ -336,6 +338,12 @@ class FrameModel:
         return np.where(there, before.residual_px[at], np.nan), before.sd_px[at], at
 
     @cached_property
+    def _waves(self) -> FloatArray:
+        """Waves (n, 12) round the shell at all features; see `waves_round`."""
+        points = self.features.points_shell_m
+        return waves_round(lv_clock(points[:, 1:]), self.view.from_ring_m(points))
+
+    @cached_property
     def _shape_sd(self) -> FloatArray:
         """A priori sd of flattening, joint station, lobes (12) and light (3) of a frame against the benchmark."""
         apriori = self.apriori
@@ -371,7 +379,7 @@ class FrameModel:
         if place is not None:
             there, before_sd, at = self._every_place_at_benchmark
             sd, painted, found = np.hypot(place[1], before_sd[lines:]), self.features, len(found_rows(place))
-            features = (painted.points_shell_m, painted.across_px, place[0], sd, there[lines:])
+            features = (painted.points_shell_m, painted.across_px, place[0], sd, there[lines:], self._waves)
             edge_at = np.concatenate([edge_at, at[lines:]])
         prior = prior or self._shape_prior(k)
         count = len(edge_at)
@@ -454,8 +462,9 @@ class FrameModel:
         # features that contradict the edge leave it residuals that are none of its scatter
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
+        # of the deflection's own rows alone, which is all that is asked of it
         alone = replace(
-            both, gain=(formal @ design.T) * weight, formal=np.asarray(min(scatter, 1.0) * formal),
+            both, gain=(formal[:2] @ design.T) * weight, formal=np.asarray(min(scatter, 1.0) * formal),
             rows=both.rows[edge], before=both.before[edge], feature_rows=both.feature_rows[:0],
         )  # fmt: skip
         return step[:2], alone
@@ -475,9 +484,8 @@ class FrameModel:
             leak = float(last.gain[0] @ last.rows[:, DEFLECTION] @ np.array([-basis[1, 0], basis[0, 0]]))
         else:
             found = np.concatenate([deformation[:2], last.shape_found[SHAPE - 2]])
-            chosen = np.concatenate([[0, 1], SHAPE])
-            parts = (part[chosen] for part in (by_camera, by_benchmark, by_light))
-            shape = FrameShape(found, last.formal[np.ix_(chosen, chosen)], *parts)
+            parts = (part[_ANSWERED] for part in (by_camera, by_benchmark, by_light))
+            shape = FrameShape(found, last.formal[_ANSWERED[:, None], _ANSWERED], *parts)
         answer, flattening = basis @ (basis.T @ deformation[:2]), float(deformation[2])
         return FrameFit(
             answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape

@@ -20,10 +20,11 @@ from estimators.edge import (
     is_coherent,
     steps_near,
 )
+from estimators.frame_residuals import waves_round
 from estimators.virtual_camera import VirtualCamera
 from flightmodel import _raster_kernels
 from flightmodel.camera import Camera, camera_from_mount
-from flightmodel.deflection import lv_direction
+from flightmodel.deflection import lv_clock, lv_direction
 from tests.oracles import plain_fit, plain_horizon, plain_sight
 
 from .conftest import VEHICLE
@@ -414,7 +415,9 @@ def fit_inputs(view, bending, edge_left=0.0):
     pixels = view.sight(points, np.array(bending)).pixels
     across = np.tile(np.eye(2), (3, 1))
     place = np.einsum("ni,ni->n", pixels, across)
-    return (found, light, np.full(m, 0.3), np.full(m, edge_left)), (points, across, place, np.full(6, 0.2), np.zeros(6))
+    waves = waves_round(lv_clock(points[:, 1:]), view.from_ring_m(points))
+    marks = (points, across, place, np.full(6, 0.2), np.zeros(6), waves)
+    return (found, light, np.full(m, 0.3), np.full(m, edge_left)), marks
 
 
 def fitted(view, edge, marks, prior, start):
