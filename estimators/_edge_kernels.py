@@ -13,7 +13,6 @@ from flightmodel._kernels import inlined, kernel
 
 _TURNS_BESIDE = 2  # on either side of the middle of a square of turns, all of which are left out at once
 _ROUNDING_PX = 1e-9
-_BLOCK = 36  # samples of a line at once: most steps lie in the second block of a hundred
 
 
 @inlined
@@ -101,17 +100,6 @@ def _grey_at(image, u, v):
     """Grey level between pixels, bilinear; the border's beyond the picture."""
     h, w = image.shape
     return _grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
-
-
-@inlined
-def _grey_across_border(image, line, first, step, begin, end, corner, size, grey, inside):
-    """Levels of samples from ``begin`` up to ``end`` of a line that may leave the picture, and which lie in it."""
-    u0, v0, du, dv = line
-    for k in range(begin, end):
-        along = first + k * step
-        u, v = u0 + along * du, v0 + along * dv
-        inside[k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
-        grey[k] = _grey_at(image, u - corner[0], v - corner[1])
 
 
 @inlined
@@ -266,6 +254,17 @@ def breaks(steps, beside, over, found):
         found[i] = below > beside
 
 
+@inlined
+def _band_along(origin, inward, outer, inner, size):
+    """As `band_of_lines`, along one axis."""
+    low, high = np.inf, -np.inf
+    for i in range(len(origin)):
+        a, b = origin[i] - outer * inward[i], origin[i] + inner * inward[i]
+        low, high = min(low, a, b), max(high, a, b)
+    first = min(max(math.floor(low) - 4, 0), size - 4)
+    return first, min(max(math.ceil(high) + 5, first + 4), size)
+
+
 @kernel
 def band_of_lines(origin, inward, outer, inner, size):
     """First and one beyond the last pixel, across and down, of what lines in a picture of a size want smoothed.
@@ -273,15 +272,9 @@ def band_of_lines(origin, inward, outer, inner, size):
     They reach so far to both sides of their origins (n, 2); beside them are the pixels between which levels lie, and
     those at a border to which levels beyond it are brought.
     """
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for i in range(len(origin)):
-        for c in range(2):
-            a, b = origin[i, c] - outer * inward[i, c], origin[i, c] + inner * inward[i, c]
-            low[c], high[c] = min(low[c], a, b), max(high[c], a, b)
-    left, right = max(math.floor(low[0]) - 4, 0), math.ceil(high[0]) + 5
-    top, bottom = max(math.floor(low[1]) - 4, 0), math.ceil(high[1]) + 5
-    left, top = min(left, size[0] - 4), min(top, size[1] - 4)
-    return left, top, min(max(right, left + 4), size[0]), min(max(bottom, top + 4), size[1])
+    left, right = _band_along(origin[:, 0], inward[:, 0], outer, inner, size[0])
+    top, bottom = _band_along(origin[:, 1], inward[:, 1], outer, inner, size[1])
+    return left, top, right, bottom
 
 
 @kernel
@@ -292,10 +285,15 @@ def sample_lines(image, origin, inward, first, step, corner, size, grey, inside)
     for i in range(n):
         line = origin[i, 0], origin[i, 1], inward[i, 0], inward[i, 1]
         begin, end = _inner_samples(line, first, step, m, image, corner, size)
-        _grey_across_border(image, line, first, step, 0, begin, corner, size, grey[i], inside[i])
-        inside[i, begin:end] = True
+        for k in range(begin, end):
+            inside[i, k] = True
         _levels_along(flat, width, line, first + begin * step, step, corner, end - begin, spare, grey[i, begin:])
-        _grey_across_border(image, line, first, step, end, m, corner, size, grey[i], inside[i])
+        for k in range(m - end + begin):
+            k = k if k < begin else k + end - begin
+            along = first + k * step
+            u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
+            inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
+            grey[i, k] = _grey_at(image, u - corner[0], v - corner[1])
 
 
 @kernel
@@ -542,8 +540,8 @@ def find_dark(image, points, terms, lens, across, search, floor, place, sd):
         u, v = pixel_of(points[i], terms, lens)
         # what the lens does not see lies far from the picture
         expected[i, 0], expected[i, 1] = (u, v) if math.isfinite(u) else (-1e6, -1e6)
+        place[i] = 0.0
     reach, half_widths, signs, noise = search
-    place[:] = 0.0
     dark_centres(image, expected, across, reach, half_widths, signs, noise, place, sd)
     for i in range(n):
         place[i] += expected[i, 0] * across[i, 0] + expected[i, 1] * across[i, 1]
@@ -584,44 +582,26 @@ def _steepest(grey, inside, hit, half, slope):
 
 
 @kernel
-def first_lasting_steps(image, origin, outward, first, step, corner, size, limits, place):
-    """Sample (n,) at which the first step from a plain beginning is steepest, on lines as of `sample_lines`; else NaN.
+def first_lasting_steps(grey, inside, limits, place):
+    """Sample (n,) at which the first step from a plain beginning is steepest, on lines (n, m) as sampled; else NaN.
 
-    ``limits``: samples of a line, of its plain beginning, on either side of a step; least step, and least over the
-    beginning's scatter. A line is sampled no farther than its step.
+    ``limits``: samples of the plain beginning, on either side of a step; least step, and least over the beginning's
+    scatter.
     """
-    count, plain, half, least, of_scatter = limits
-    grey, inside, slope = np.empty(count), np.empty(count, dtype=np.bool_), np.empty(count)
-    flat, width, spare = image.ravel(), image.shape[1], _spare(image, count)
-    for i in range(len(origin)):
-        line = origin[i, 0], origin[i, 1], outward[i, 0], outward[i, 1]
-        inner = _inner_samples(line, first, step, count, image, corner, size)
+    plain, half, least, of_scatter = limits
+    n, m = grey.shape
+    slope = np.empty(m)
+    for i in range(n):
         place[i] = np.nan
-        begin, held, needed, hit, enough = -1, 0, count, -1, 0.0
-        k, tried = 0, half
-        while k < needed:
-            upto = min(k + _BLOCK, needed)
-            if inner[0] <= k and upto <= inner[1]:
-                inside[k:upto] = True
-                _levels_along(flat, width, line, first + k * step, step, corner, upto - k, spare, grey[k:])
-            else:
-                _grey_across_border(image, line, first, step, k, upto, corner, size, grey, inside)
-            while begin < 0 and k < upto:
-                if inside[k]:
-                    begin, tried = k, k + half
-                k += 1
-            if begin >= 0 and held == 0 and upto >= min(begin + plain, count):
-                held = min(begin + plain, count)
-                enough = max(least, of_scatter * max(_scatter(grey, begin, plain, held), 1.0))
-            # once the beginning is known, every sample so far may be the end of a step
-            while held > 0 and hit < 0 and tried < upto - half:
-                if inside[tried] and abs(grey[tried + half] - grey[tried - half]) > enough:
-                    hit = tried
-                    needed = min(hit + 4 * half + 2, count)
-                tried += 1
-            k = upto
-        if hit >= 0:
-            place[i] = _steepest(grey, inside, hit, half, slope)
+        begin = 0
+        while begin < m and not inside[i, begin]:
+            begin += 1
+        held = min(begin + plain, m)
+        enough = max(least, of_scatter * max(_scatter(grey[i], begin, plain, held), 1.0))
+        for j in range(begin + half, m - half):
+            if inside[i, j] and abs(grey[i, j + half] - grey[i, j - half]) > enough:
+                place[i] = _steepest(grey[i], inside[i], j, half, slope)
+                break
 
 
 @kernel

@@ -123,6 +123,14 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 
 @inlined
+def _turn(columns, first, turned):
+    """Columns (n, q) as rows from ``first`` on."""
+    for i in range(len(columns)):
+        for j in range(columns.shape[1]):
+            turned[first + j, i] = columns[i, j]
+
+
+@inlined
 def _lower_products(columns, count, weight, first, weighted, product):
     """Weighted products of points' columns, one a row (q, n), with those up to themselves, from the ``first`` row on.
 
@@ -246,7 +254,9 @@ def solved(columns, residual, weight, prior, flattening, formal, found):
     """
     m, n = columns.shape
     turned, normal = np.empty((n + 1, m)), np.empty((n + 1, n + 1))
-    turned[:n], turned[n] = columns.T, residual
+    _turn(columns, 0, turned)
+    for i in range(m):
+        turned[n, i] = residual[i]
     _lower_products(turned, m, weight, 0, np.empty(m), normal)
     _add_prior(prior, flattening, n - len(prior[0]), normal, found)
     small_cholesky(normal, n, normal)
@@ -290,9 +300,9 @@ def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
 def turned_to_axes(matrix, axes):
     """Turn a symmetric matrix (m, m) to its axes, the columns of ``axes``, in place (C. G. J. Jacobi, 1846)."""
     m = len(matrix)
-    axes[:] = 0.0
     for a in range(m):
-        axes[a, a] = 1.0
+        for b in range(m):
+            axes[a, b] = 1.0 if a == b else 0.0
     for _ in range(_SWEEPS):
         is_diagonal = True
         for a in range(m):
@@ -327,7 +337,10 @@ def motion_beside(columns, formal, by, residual, weight, allowed, motion):
     """
     (n, k), m = columns.shape, by.shape[1]
     turned, product = np.empty((k + m + 1, n)), np.empty((k + m + 1, k + m + 1))
-    turned[:k], turned[k : k + m], turned[k + m] = columns.T, by.T, residual
+    _turn(columns, 0, turned)
+    _turn(by, k, turned)
+    for i in range(n):
+        turned[k + m, i] = residual[i]
     _lower_products(turned, n, weight, k, np.empty(n), product)
     inverse, axes, right = np.empty((m, m)), np.empty((m, m)), np.empty(m)
     fitted = np.empty(k)
@@ -345,9 +358,9 @@ def motion_beside(columns, formal, by, residual, weight, allowed, motion):
             else:
                 right[j] = left
     turned_to_axes(inverse, axes)
-    motion[:] = 0.0
     most, square = 0.0, 0.0
     for q in range(m):
+        motion[q] = 0.0
         most = max(most, inverse[q, q])
     for q in range(m):
         value, along = inverse[q, q], 0.0

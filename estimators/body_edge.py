@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from estimators import _edge_kernels
-from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, smoothed_about
+from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, sampled
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -111,13 +111,9 @@ def _lines(view: VirtualCamera) -> ScanLines | None:
 
 def _places(picture: KeptPicture, lines: ScanLines) -> FloatArray:
     """Where the edge lies on each line (n,), px from its origin; NaN where there is none, or none beside it."""
-    count = round(2.0 * _REACH_PX / STEP_PX) + 1
-    limits = (count, _LEVEL, _HALF, _LEAST_STEP, _OF_SCATTER)
+    grey, inside = sampled(picture, lines, round(2.0 * _REACH_PX / STEP_PX) + 1)
     at = np.empty(len(lines.index))
-    smooth, corner, size = smoothed_about(picture, lines)
-    _edge_kernels.first_lasting_steps(
-        smooth, lines.origin_px, lines.inward_px, -_REACH_PX, STEP_PX, corner, size, limits, at
-    )  # fmt: skip
+    _edge_kernels.first_lasting_steps(grey, inside, (_LEVEL, _HALF, _LEAST_STEP, _OF_SCATTER), at)
     place = STEP_PX * at - _REACH_PX
     place[~is_coherent(lines.index, _SMOOTHER * place)] = np.nan
     return place

@@ -341,23 +341,18 @@ def kept_picture(image: Image | KeptPicture) -> KeptPicture:
 
 def sampled(image: Image | KeptPicture, lines: ScanLines, count: int) -> tuple[FloatArray, BoolArray]:
     """Smoothed grey levels ``(n, count)`` along lines, and whether they lie in the picture."""
-    smooth, corner, size = smoothed_about(kept_picture(image), lines)
+    picture = kept_picture(image)
+    h, w = picture.image.shape
+    # only the band that the lines cross is smoothed
+    smooth, corner = picture.band(
+        _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, (w, h))
+    )
     n = len(lines.origin_px)
     grey, inside = np.empty((n, count)), np.empty((n, count), dtype=np.bool_)
     _edge_kernels.sample_lines(
-        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, size, grey, inside
+        smooth, lines.origin_px, lines.inward_px, -lines.outer_px, STEP_PX, corner, (float(w), float(h)), grey, inside
     )  # fmt: skip
     return grey, inside
-
-
-def smoothed_about(
-    picture: KeptPicture, lines: ScanLines
-) -> tuple[NDArray[np.float32], tuple[float, float], tuple[float, float]]:
-    """Smoothed grey levels of at least what lines cross, the pixel that comes first, the picture's width and height."""
-    h, w = picture.image.shape
-    # only the band that the lines cross is smoothed
-    span = _edge_kernels.band_of_lines(lines.origin_px, lines.inward_px, lines.outer_px, lines.inner_px, (w, h))
-    return *picture.band(span), (float(w), float(h))
 
 
 def _edge_bases(places: FloatArray, along: FloatArray) -> FloatArray:

@@ -313,8 +313,8 @@ def test_the_first_step_on_a_line_is_the_plain_one(top):
     origin[:, 1] += top
     grey, inside = np.empty((23, count)), np.empty((23, count), dtype=np.bool_)
     _edge_kernels.sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
-    limits, place = (count, 12, 4, 8.0, 4.0), np.empty(23)
-    _edge_kernels.first_lasting_steps(picture, origin, outward, -24.0, STEP_PX, corner, size, limits, place)
+    limits, place = (12, 4, 8.0, 4.0), np.empty(23)
+    _edge_kernels.first_lasting_steps(grey, inside, limits, place)
     expected = plain_horizon.first_lasting_steps(grey, inside, limits)
     np.testing.assert_allclose(place, expected, atol=1e-9)
     assert 0 < np.isnan(place).sum() < 12

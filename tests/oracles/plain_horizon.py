@@ -68,7 +68,7 @@ def share_of_second_edge(steps, by_turn, limits):
 
 def first_lasting_steps(grey, inside, limits):
     """Sample of each line (n, m) at which its first step from a plain beginning is steepest; NaN without one."""
-    count, plain, half, least, of_scatter = limits
+    (plain, half, least, of_scatter), count = limits, grey.shape[1]
     rows, samples = np.arange(len(grey)), np.arange(count)
     first = np.argmax(inside, axis=1)
     level = np.minimum(first[:, None] + np.arange(plain), count - 1)
