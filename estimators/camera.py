@@ -30,6 +30,7 @@ from estimators.camera_fit import Image, OrientedCamera
 from estimators.edge import NO_FAULT, no_horizon
 from estimators.frame_edits import edited
 from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
+from estimators.surface_noise import mixed_with
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, Progress, check_finite, check_increasing
@@ -52,7 +53,7 @@ _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a s
 _OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
 _NOT_THE_SHELL = (
     "camera-turned", "picture-warped", "picture-doubled", "edge-not-shell", "features-contradict-edge",
-    "halves-differ", "shell-little-seen", "features-lost",
+    "halves-differ", "shell-little-seen", "features-lost", "picture-mixed",
 )  # fmt: skip
 # share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
 # (over so many frames that they are not the benchmark's neighbours alone)
@@ -404,15 +405,28 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
 
 
 def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse a film of which some frames show the edge twice: its others mix pictures too, with edges closer together.
+    """Refuse frames that have the noise of an earlier one, and a film of which some do, or show the edge twice.
 
-    A converter of frame rates does that to a whole film. Frames count that may show it twice: one alone may by chance.
+    A converter of frame rates does that to a whole film: its others mix pictures too, with edges closer together.
+    Frames count that may show the edge twice: one alone may by chance.
     """
-    doubled = sum(getattr(fit.refused, "code", "") == "picture-doubled" or fit.doubled > 0.0 for fit in fits)
-    if doubled < max(_LEAST_MIXED, _MIXED * len(fits)):
-        return fits
-    words = f"{doubled} frames show, or may show, the edge twice: the film mixes pictures; an edge may lie between two"
-    return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
+    mixed = mixed_with([None if fit.refused else fit.noise for fit in fits])
+    doubled = {k for k, f in enumerate(fits) if getattr(f.refused, "code", "") == "picture-doubled" or f.doubled > 0.0}
+    some = len(doubled | set(mixed))
+    if some >= max(_LEAST_MIXED, _MIXED * len(fits)):
+        words = (
+            f"{some} frames show, or may show, the edge twice or the noise of a frame before: the film mixes pictures; "
+            "an edge may lie between two"
+        )
+        return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
+    out = list(fits)
+    for k, (j, share) in mixed.items():
+        words = (
+            f"its noise is in part (correlation {share:.2f}) that of {k - j} frames before: a picture mixed with that "
+            "one, or a part of it held over"
+        )
+        out[k] = refused_fit(fits[k].horizon, Fault(words, "picture-mixed"))
+    return out
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:

@@ -139,7 +139,7 @@ class OrientedCamera(FrameModel):
         fault = fault_of_frame(frame.kept, self.view.camera.size_px) or self._fault_of_breaks(frame)
         if fault:
             return refused_fit(no_horizon(fault), fault)
-        deformation, basis, horizon, doubled = np.zeros(3), np.eye(2), _NOTHING, 0.0
+        deformation, basis, horizon, doubled, moved_var = np.zeros(3), np.eye(2), _NOTHING, 0.0, 0.0
         deformation[:2] = 0.0 if start is None else start
         with_open_plane: FrameFit | None = None
         mount_px, mount_is_sure = self._mount_px(frame)
@@ -166,11 +166,11 @@ class OrientedCamera(FrameModel):
                         "camera moved in its mount, or the picture was moved",
                         "camera-turned",
                     )
-                last = self._explained(place, deformation, last)
+                last, moved_var = self._explained(place, deformation, last)
             if plane_axis is not None:
                 # whether this is the shell was tested with both parameters: an assumed plane alone may fit badly;
                 # the seed paper's way uses the edge alone
-                with_open_plane = self._answer(horizon, deformation, last, basis)
+                with_open_plane = self._answer(horizon, deformation, last, basis, moved_var)
                 basis = plane_axis[:, None]
                 horizon = self.coherent_edge(frame, deformation)
                 # what the plane does not explain is more than any point's own error: all count alike
@@ -179,10 +179,11 @@ class OrientedCamera(FrameModel):
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except NoFitError as refusal:
             return refused_fit(horizon, refusal.faults[0], mount_px, mount_is_sure)
-        answer = self._answer(horizon, deformation, last, basis)
+        answer = self._answer(horizon, deformation, last, basis, moved_var)
         return replace(
             answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px, mount_is_sure=mount_is_sure,
             with_open_plane=with_open_plane,
+            noise=None if self.noise_places is None else self.noise_places.noise(frame, deformation[:2]),
         )  # fmt: skip
 
     def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
@@ -199,30 +200,32 @@ class OrientedCamera(FrameModel):
 
     def _explained(
         self, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray, both: Solution
-    ) -> Solution:
-        """Edge and features, or most features alone if clouds along the edge pass for a shape; else `NoFitError`."""
+    ) -> tuple[Solution, float]:
+        """Edge and features, or most features alone if clouds along the edge pass for a shape; else `NoFitError`.
+
+        Last: variance by a motion of the picture that may be.
+        """
         try:
-            self._check_explained(both)
-            return both
+            return both, self._check_explained(both)
         except NoFitError as fault:
             most = max(USUAL_SHARE * self._benchmark_counts[1], LEAST_FEATURES)
             if fault.codes != ("edge-not-shell",) or place is None or not len(found_rows(place)) > most:
                 raise
         alone = self._solve(_NOTHING, place, deformation, np.eye(2), USUAL_RMS_PX)
-        self._check_explained(alone)
-        return alone
+        return alone, self._check_explained(alone)
 
-    def _check_explained(self, last: Solution) -> None:
-        """Refuse a frame that no deflection explains, by `estimators.frame_checks`."""
+    def _check_explained(self, last: Solution) -> float:
+        """Refuse a frame that no deflection explains; variance of one that may be moved: `estimators.frame_checks`."""
         rows, focal = last.rows, float(self.view.camera.focal_px[0])
         design = Design(
             last.columns, last.formal, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight,
             last.edge_count,
         )  # fmt: skip
         shape = last.shape_found / self._shape_sd
-        fault = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
+        fault, variance = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
         if fault:
             raise NoFitError(fault)
+        return variance
 
     def _check_seen(self, horizon: HorizonLine, last: Solution) -> None:
         """Refuse a frame of which little is seen: what there is may agree by chance."""

@@ -4,7 +4,9 @@ Tested at the end of a frame's fit are the rms of its residuals, the shape and l
 priori sd, two ways in which the picture may have moved since the benchmark frame (a turn of the camera in its mount
 with another focal length, and a warp, as by a drop on the lens or by rows that slip), and whether the features in the
 upper and in the lower half of the picture give one deflection: what makes a deflection of a picture that slips or is
-composed of two is not the same in both. With the design ``D`` of
+composed of two is not the same in both. Shape, turn and warp are each tested, and all together. What is no fault yet
+but more than chance is in the answer's variance: the deflection that a turn and zoom of its size would look like, and
+how far apart the halves are, the left and the right one too. With the design ``D`` of
 deflection, shape and light, weights ``W``, prior ``P``, residuals ``r`` and the derivatives ``T`` by a motion ``m``,
 
     m = C T' W (r - D x),    x = (D' W D + P)^-1 D' W r,    C^-1 = T' W T - T' W D (D' W D + P)^-1 D' W T
@@ -30,6 +32,10 @@ USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
 # chi-square that one sound frame in 10,000 exceeds: of seventeen of shape and light, of three rotations and a focal
 # length, of twelve terms of a warp, of two components of deflection
 WORST_SHAPE, _WORST_TURN, _WORST_WARP, _WORST_HALVES = 47.6, 23.5, 39.1, 18.4
+_WORST_TOGETHER = 72.0  # of the thirty-three of shape, turn and warp
+# chi-square of two components that one sound frame in 100 exceeds, here of two halves: 4 at the most in the simulator's
+# films; light on another renderer's cloth gives more in 5 frames of 100
+_BY_CHANCE = 9.2
 # sd of a half's deflection by shapes that are not modelled and points that err alike: with it the chi-square of two is
 # 1.5 at the most in 216 fits of sound frames, 8.6 in some of another renderer's, 8 to 90 in frames of which rows slip
 _HALF_RAD = float(np.deg2rad(0.02))
@@ -78,12 +84,17 @@ class Design:
         terms = np.column_stack([np.ones_like(u), u, v, u * u, u * v, v * v])
         return np.concatenate([terms * across[:, None] for across in self.across.T], axis=1)
 
-    @property
-    def halves(self) -> FloatArray:
-        """Derivatives (n, 2) by a deflection that the upper half of the features adds and the lower half subtracts."""
-        down = self.places[1][self.edge_points :]
-        side = np.append(np.zeros(self.edge_points), np.where(down < np.median(down), 1.0, -1.0))
-        return self.columns[:, :2] * side[:, None]
+    @cached_property
+    def halves(self) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (n, 2) by a deflection that the left half of the features adds and the right half subtracts.
+
+        Last: the upper half and the lower.
+        """
+        left, upper = (
+            np.append(np.zeros(self.edge_points), np.where(at < np.median(at), 1.0, -1.0))
+            for at in (place[self.edge_points :] for place in self.places)
+        )
+        return self.columns[:, :2] * left[:, None], self.columns[:, :2] * upper[:, None]
 
     def motion(self, by: FloatArray, allowed: float) -> tuple[FloatArray, float]:
         """Motion (m,) that explains the residuals best, with derivatives (n, m), and its chi-square.
@@ -97,8 +108,10 @@ class Design:
         return motion, square
 
 
-def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> Fault:
+def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> tuple[Fault, float]:
     """Why a deflection does not explain a frame, with its code; empty where it does.
+
+    Last: variance, rad^2, of either component of the answer by what is no fault, but more than chance.
 
     Parameters
     ----------
@@ -112,33 +125,60 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
     """
     if rms_px > USUAL_RMS_PX:
         words = f"rms {rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are allowed"
-        return Fault(f"no deflection explains edge and features: {words}", "edge-not-shell")
+        return Fault(f"no deflection explains edge and features: {words}", "edge-not-shell"), 0.0
     if shape @ shape > WORST_SHAPE:
         words = (
             f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of {len(shape)}) from "
             f"the benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
-        return Fault(words, "edge-not-shell")
+        return Fault(words, "edge-not-shell"), 0.0
+    together = float(shape @ shape)
     turn, square = design.motion(design.turn, lobes_rad)
+    together += square
     if square > _WORST_TURN:
         words = (
             f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn[:3])):.1f} deg in its mount and zoomed by "
             f"{100.0 * turn[3]:.1f} % since the benchmark frame, or edge and features are not the shell's alone"
         )
-        return Fault(words, "camera-turned")
+        return Fault(words, "camera-turned"), 0.0
+    # by so much it would move the answer; a sound frame's chi-square is as large as the number of terms in the mean
+    variance = _beyond(square, len(turn)) * float(np.sum((design.gain[:2] @ (design.turn @ turn)) ** 2))
     warp, square = design.motion(design.warp, lobes_rad * design.focal_px)
     if square > _WORST_WARP:
         words = (
             f"the picture seems warped by up to {np.abs(design.warp @ warp).max():.0f} px since the benchmark frame: a "
             "drop on the lens, rows that slip, or edge and features are not the shell's alone"
         )
-        return Fault(words, "picture-warped")
-    if design.edge_points < len(design.columns):
-        apart, square = design.motion(design.halves, _HALF_RAD)
-        if square > _WORST_HALVES:
+        return Fault(words, "picture-warped"), 0.0
+    if together + square > _WORST_TOGETHER:
+        words = (
+            f"shape, turn and warp of the picture together are improbable (chi-square {together + square:.0f} of "
+            f"{len(shape) + len(turn) + len(warp)}): rows that slip, or edge and features are not the shell's alone"
+        )
+        return Fault(words, "picture-warped"), 0.0
+    fault, apart = _fault_of_halves(design)
+    return fault, variance + apart
+
+
+def _fault_of_halves(design: Design) -> tuple[Fault, float]:
+    """As `fault_of_fit`, of the halves of the features."""
+    if design.edge_points == len(design.columns):
+        return NO_FAULT, 0.0
+    variance = 0.0
+    for by, is_tested in zip(design.halves, (False, True), strict=True):
+        apart, square = design.motion(by, _HALF_RAD)
+        off_rad = 2.0 * float(np.linalg.norm(apart))
+        if is_tested and square > _WORST_HALVES:
             words = (
-                f"features in the upper and the lower half of the picture give deflections "
-                f"{2.0 * np.rad2deg(np.linalg.norm(apart)):.1f} deg apart: rows that slip, or two pictures in one"
+                f"features in the upper and the lower half of the picture give deflections {np.rad2deg(off_rad):.1f} "
+                "deg apart: rows that slip, or two pictures in one"
             )
-            return Fault(words, "halves-differ")
-    return NO_FAULT
+            return Fault(words, "halves-differ"), 0.0
+        # which half is right is not known, nor how far both err together
+        variance += _beyond(square, _BY_CHANCE) * off_rad**2
+    return NO_FAULT, variance
+
+
+def _beyond(square: float, usual: float) -> float:
+    """Share of a chi-square beyond what is usual."""
+    return 1.0 - usual / max(square, usual)

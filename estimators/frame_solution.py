@@ -43,6 +43,7 @@ from estimators.features import Features, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS
 from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
+from estimators.surface_noise import NoisePlaces, SurfaceNoise, noise_places
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock
@@ -143,6 +144,10 @@ class FrameFit:
         Error per unit error of the shell's shape under load as the film determined it, where that was used.
     with_open_plane : FrameFit or None
         Of the same frame with its plane estimated, where one is assumed.
+    noise : SurfaceNoise or None
+        Of the picture inside the shell's edge.
+    moved_var : float
+        Part of either component's variance by a motion of the picture that may be; see `estimators.frame_checks`.
     """
 
     rotation_yz_rad: FloatArray
@@ -161,6 +166,8 @@ class FrameFit:
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
     with_open_plane: FrameFit | None = None
+    noise: SurfaceNoise | None = None
+    moved_var: float = 0.0
 
 
 class NoFitError(GateError):
@@ -306,6 +313,14 @@ class FrameModel:
     def edge_in_view(self) -> float:
         """Share of the edge looked for that the benchmark frame shows."""
         return self._benchmark_counts[0] / max(len(self.clocks_rad), 1)
+
+    @cached_property
+    def noise_places(self) -> NoisePlaces | None:
+        """Pixels inside the benchmark frame's edge at which a frame's noise is looked at."""
+        rest = np.zeros(3)
+        lines = self.view.lines_at(self.clocks_rad, rest)
+        on_edge = HorizonLine(lines.origin_px, lines.inward_px, np.ones(len(lines.index)), lines.index)
+        return noise_places(self.view, lines, self.view.mismatch(on_edge, self.view.edge(rest))[1][:, DEFLECTION])
 
     def _edge_share(self, points: int) -> float:
         """So many edge points over those of the benchmark frame; none where that shows no edge."""
@@ -469,7 +484,10 @@ class FrameModel:
         )  # fmt: skip
         return step[:2], alone
 
-    def _answer(self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray) -> FrameFit:
+    def _answer(
+        self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray,
+        moved_var: float = 0.0,
+    ) -> FrameFit:  # fmt: skip
         k, by_camera = basis.shape[1], last.by_pose
         by_benchmark = last.by_deflection + by_camera @ self.posed_per_deflection
         features, shape, leak = len(last.feature_rows), None, 0.0
@@ -486,10 +504,12 @@ class FrameModel:
             found = np.concatenate([deformation[:2], last.shape_found[SHAPE - 2]])
             parts = (part[_ANSWERED] for part in (by_camera, by_benchmark, by_light))
             shape = FrameShape(found, last.formal[_ANSWERED[:, None], _ANSWERED], *parts)
+            covariance = covariance + moved_var * np.eye(2)
         answer, flattening = basis @ (basis.T @ deformation[:2]), float(deformation[2])
         return FrameFit(
-            answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape
-        )
+            answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape,
+            moved_var=moved_var,
+        )  # fmt: skip
 
     def covariance_of(self, formal: FloatArray, by_camera: FloatArray, by_benchmark: FloatArray) -> FloatArray:
         """Covariance of an answer with that of the camera's pose and of the benchmark frame's deflection."""

@@ -138,10 +138,10 @@ def test_what_a_turn_a_zoom_or_a_warp_explains_is_no_deflection():
     lobes, shape = np.deg2rad(0.1), np.zeros(17)
 
     def code(moved_px):
-        fault = fault_of_fit(replace(design, residual_px=design.residual_px + moved_px), 0.5, shape, lobes)
+        fault = fault_of_fit(replace(design, residual_px=design.residual_px + moved_px), 0.5, shape, lobes)[0]
         return getattr(fault, "code", "")
 
-    assert not fault_of_fit(design, 0.5, shape, lobes)
+    assert fault_of_fit(design, 0.5, shape, lobes) == ("", 0.0)
     assert code(design.turn @ np.deg2rad([0.0, 0.0, 2.0, 0.0])) == "camera-turned"
     assert code(design.turn @ [0.0, 0.0, 0.0, 0.05]) == "camera-turned"
     # what lobes that are not modelled may look like
@@ -151,6 +151,30 @@ def test_what_a_turn_a_zoom_or_a_warp_explains_is_no_deflection():
     bent -= explained @ np.linalg.lstsq(explained, bent)[0]
     assert code(20.0 * bent) == "picture-warped"
     assert code(0.5 * bent) == ""
+    # and where shape, turn and warp are each a little improbable
+    shape = np.full(17, 1.6)
+    assert code(np.zeros(len(bent))) == ""
+    warped = next(k for k in np.arange(1.0, 20.0, 0.25) if code(k * bent))
+    assert code(warped * bent) == "picture-warped"
+    shape = np.zeros(17)
+    assert code(warped * bent) == ""
+
+
+def test_a_zoom_that_is_no_fault_yet_is_in_the_variance():
+    """By what it moves the answer, a deflection being fitted alone, as far as it is beyond chance."""
+    design, _ = sound_design(3.0)
+    lobes, shape, zoom = np.deg2rad(0.1), np.zeros(17), 0.006
+    assert fault_of_fit(design, 0.5, shape, lobes) == ("", 0.0)
+    # all of them edge points: no halves
+    design = replace(design, edge_points=len(design.columns))
+    moved = replace(design, residual_px=design.residual_px + zoom * design.turn[:, 3])
+    fault, variance = fault_of_fit(moved, 0.5, shape, lobes)
+    assert not fault
+    fitted = np.linalg.lstsq(np.column_stack([design.columns, design.turn]), moved.residual_px)[0]
+    alone = np.linalg.lstsq(design.columns, moved.residual_px)[0]
+    square = moved.motion(design.turn, lobes)[1]
+    assert square > 8.0
+    assert variance == pytest.approx((1.0 - 4.0 / square) * np.sum((fitted[:2] - alone) ** 2), rel=1e-6)
 
 
 def test_two_halves_of_a_picture_have_one_deflection():
@@ -158,23 +182,51 @@ def test_two_halves_of_a_picture_have_one_deflection():
     design, _ = sound_design(3.0)
     lobes, shape = np.deg2rad(0.1), np.zeros(17)
     explained = np.column_stack([design.columns, design.turn, design.warp])
-    apart = design.halves @ np.deg2rad([0.9, 0.0])
+    left, upper_by = design.halves
+    apart = upper_by @ np.deg2rad([0.9, 0.0])
     apart -= explained @ np.linalg.lstsq(explained, apart)[0]
 
     def fault(moved_px, edge_points=0):
         spoilt = replace(design, residual_px=design.residual_px + moved_px, edge_points=edge_points)
-        return fault_of_fit(spoilt, 0.5, shape, lobes)
+        return fault_of_fit(spoilt, 0.5, shape, lobes)[0]
 
     assert not fault(np.zeros(len(apart)))
     assert fault(apart).code == "halves-differ"
-    fitted = np.linalg.lstsq(np.column_stack([design.halves, design.columns]), design.residual_px + apart)[0][:2]
+    fitted = np.linalg.lstsq(np.column_stack([upper_by, design.columns]), design.residual_px + apart)[0][:2]
     assert numbers_in(fault(apart))[0] == pytest.approx(2.0 * np.rad2deg(np.linalg.norm(fitted)), abs=0.06)
     assert not fault(0.1 * apart)
     # all of them edge points, and none a feature
     assert not fault(apart, len(apart))
     upper = design.places[1] < np.median(design.places[1])
-    np.testing.assert_array_equal(design.halves[upper], design.columns[upper, :2])
-    np.testing.assert_array_equal(design.halves[~upper], -design.columns[~upper, :2])
+    np.testing.assert_array_equal(upper_by[upper], design.columns[upper, :2])
+    np.testing.assert_array_equal(upper_by[~upper], -design.columns[~upper, :2])
+    on_left = design.places[0] < np.median(design.places[0])
+    np.testing.assert_array_equal(left[on_left], design.columns[on_left, :2])
+    np.testing.assert_array_equal(left[~on_left], -design.columns[~on_left, :2])
+
+
+def test_halves_that_differ_by_less_widen_the_answer():
+    """The left half and the right one: by the square of how far they are apart, where that is beyond chance."""
+    design, _ = sound_design(3.0)
+    lobes, shape = np.deg2rad(0.1), np.zeros(17)
+    explained = np.column_stack([design.columns, design.turn, design.warp])
+
+    def variance(size_deg):
+        apart = design.halves[0] @ np.deg2rad([size_deg, 0.0])
+        apart -= explained @ np.linalg.lstsq(explained, apart)[0]
+        spoilt = replace(design, residual_px=design.residual_px + apart)
+        fault, found = fault_of_fit(spoilt, 0.5, shape, lobes)
+        assert not fault
+        half, square = spoilt.motion(spoilt.halves[0], np.deg2rad(0.02))
+        return found, 4.0 * half @ half, square
+
+    assert variance(0.0)[0] == 0.0
+    found, size, square = variance(1.5)
+    assert square > 20.0
+    assert found == pytest.approx((1.0 - 9.2 / square) * size, rel=1e-6)
+    # all of them edge points, and none a feature
+    moved = replace(design, residual_px=design.residual_px + np.deg2rad(1.5) * design.halves[0][:, 0])
+    assert fault_of_fit(replace(moved, edge_points=len(moved.columns)), 0.5, shape, np.deg2rad(10.0))[1] == 0.0
 
 
 def test_a_frozen_picture_is_no_frame(frames):
