@@ -147,7 +147,8 @@ class FrameFit:
     noise : SurfaceNoise or None
         Of the picture inside the shell's edge.
     moved_var : float
-        Part of either component's variance by a motion of the picture that may be; see `estimators.frame_checks`.
+        Part of either component's variance by a motion of the picture that may be, with the plane estimated; see
+        `estimators.frame_checks`.
     """
 
     rotation_yz_rad: FloatArray
@@ -485,9 +486,8 @@ class FrameModel:
         return step[:2], alone
 
     def _answer(
-        self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray,
-        moved_var: float = 0.0,
-    ) -> FrameFit:  # fmt: skip
+        self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray, moved_var: float
+    ) -> FrameFit:
         k, by_camera = basis.shape[1], last.by_pose
         by_benchmark = last.by_deflection + by_camera @ self.posed_per_deflection
         features, shape, leak = len(last.feature_rows), None, 0.0

@@ -392,8 +392,7 @@ def _given_shape(
     answer = again @ own.found_rad + by_shape @ shape.found_rad
     by_camera, by_benchmark = again @ own.by_camera, again @ own.by_benchmark
     covariance = oriented.covariance_of(formal[:, :2], by_camera, by_benchmark)
-    covariance = covariance + by_shape @ shape.found_covariance @ by_shape.T
-    covariance = covariance + fit.moved_var * np.eye(2)
+    covariance = covariance + by_shape @ shape.found_covariance @ by_shape.T + fit.moved_var * np.eye(2)
     return replace(fit, rotation_yz_rad=answer, covariance=covariance, per_benchmark=by_benchmark, by_shape=by_shape)
 
 

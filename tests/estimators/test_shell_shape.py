@@ -204,6 +204,16 @@ def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():
         )
 
 
+def test_a_motion_of_the_picture_stays_in_the_variance():
+    """The film's shape explains lobes, not a lens that zoomed."""
+    one, k = drawn(np.random.default_rng(5), ("two waves",))[0], int(np.argmax(PRESSURE_PA))
+    shape = shell_shape([one])
+    fits = tuple(replace(fit, moved_var=D(0.3) ** 2) if j == k else fit for j, fit in enumerate(one.film.fits))
+    moved = replace(one, film=replace(one.film, fits=fits))
+    sound, wider = (with_shape([film], shape)[0].fits[k].covariance for film in (one, moved))
+    np.testing.assert_allclose(wider, sound + D(0.3) ** 2 * np.eye(2), rtol=1e-9)
+
+
 def test_a_film_without_answers_leaves_the_others_theirs():
     rng = np.random.default_rng(6)
     film, dark = (drawn(rng, ())[0] for _ in range(2))
