@@ -223,7 +223,7 @@ def test_halves_that_differ_by_less_widen_the_answer():
     assert variance(0.0)[0] == 0.0
     found, size, square = variance(1.5)
     assert square > 20.0
-    assert found == pytest.approx((1.0 - 9.2 / square) * size, rel=1e-6)
+    assert found == pytest.approx((1.0 - 18.4 / square) * size, rel=1e-6)
     # all of them edge points, and none a feature
     moved = replace(design, residual_px=design.residual_px + np.deg2rad(1.5) * design.halves[0][:, 0])
     assert fault_of_fit(replace(moved, edge_points=len(moved.columns)), 0.5, shape, np.deg2rad(10.0))[1] == 0.0
