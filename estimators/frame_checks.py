@@ -74,6 +74,10 @@ class Design:
         along, roll, (a, b) = self.turn[:, 3], self.turn[:, 2], self.across.T
         return (along * a + roll * b) / self.focal_px, (along * b - roll * a) / self.focal_px
 
+    def answer_to(self, moved_px: FloatArray) -> FloatArray:
+        """Deflection (2,), rad, that the fit answers to points moved by (n,)."""
+        return self.formal[:2] @ (self.columns.T @ (self.weight * moved_px))
+
     @property
     def warp(self) -> FloatArray:
         """Derivatives (n, 12) by a warp of the picture, its coordinates over the focal length, px."""
@@ -139,7 +143,7 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
         )
         return Fault(words, "camera-turned"), 0.0
     # by so much it would move the answer; a sound frame's chi-square is as large as the number of terms in the mean
-    variance = _beyond(square, len(turn)) * float(np.sum((design.gain[:2] @ (design.turn @ turn)) ** 2))
+    variance = _beyond(square, len(turn)) * float(np.sum(design.answer_to(design.turn @ turn) ** 2))
     warp, square = design.motion(design.warp, lobes_rad * design.focal_px)
     if square > _WORST_WARP:
         words = (
