@@ -15,6 +15,7 @@ What of a reconciliation does not need the fit? The second process does it, and 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,7 +46,7 @@ from synthetic_flight.dispersions import (
     rng_from_draw,
 )
 from synthetic_flight.dynamics import check_step
-from synthetic_flight.ensemble import LANES, Flown, Records, Start, fly_legs
+from synthetic_flight.ensemble import LANES, Flown, Records, Start, fly_ensemble
 from synthetic_flight.simulate import Schedule, state_from_ecef
 from synthetic_flight.weather import correlated
 
@@ -139,22 +140,20 @@ def entry_bounds(
     """
     report = progress or (lambda _fraction, _what: None)
     entry = _Entry(flight, vehicle or flight.telemetry.required_vehicle().at(flight.peak_s), joint)
-    nominal = entry.fly([entry.start(None)])[0]
-    alpha, normal = np.empty((2, flights, entry.records))
+    alpha, normal = np.empty((2, 1 + flights, entry.records))  # the nominal flight first
     ended = 0
     what = "rigid" if joint is None else "flexible"
-    for first in range(0, flights, LANES):
-        runs = range(first, min(first + LANES, flights))
-        for k, found in zip(runs, entry.fly([entry.start((seed, run)) for run in runs]), strict=True):
-            alpha[k], normal[k], diverged = found
-            ended += diverged
-        report(runs.stop / flights, f"{what} flight {runs.stop} of {flights}")
+    for k, found in enumerate(entry.fly([None, *((seed, run) for run in range(flights))])):
+        alpha[k], normal[k], diverged = found
+        ended += diverged and k > 0
+        if k % LANES == 0 or k == flights:
+            report(k / flights, f"{what} flight {k} of {flights}")
     return Bounds(
         time_s=entry.start_s + RECORD_S * np.arange(entry.records),
-        alpha_total_deg=percentile_band(alpha),
-        normal_g=percentile_band(normal),
-        nominal_alpha_deg=nominal[0],
-        nominal_normal_g=nominal[1],
+        alpha_total_deg=percentile_band(alpha[1:]),
+        normal_g=percentile_band(normal[1:]),
+        nominal_alpha_deg=alpha[0],
+        nominal_normal_g=normal[0],
         flights=flights,
         ended=ended,
     )
@@ -210,10 +209,16 @@ class _Entry:
         parameters = simulate.parameter_vector(vehicle, *scales)
         return Start(state, parameters, simulate.atmosphere_table(profile)), vehicle
 
-    def fly(self, starts: list[tuple[Start, Vehicle]]) -> list[tuple[FloatArray, FloatArray, bool]]:
-        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether the flight ended early."""
-        flown = fly_legs(self.vehicle, list(range(len(starts))), [s for s, _ in starts], [self.schedule])
-        return [self._kept(f, start, vehicle) for f, (start, vehicle) in zip(flown, starts, strict=True)]
+    def fly(self, runs: list[tuple[int, int] | None]) -> Iterator[tuple[FloatArray, FloatArray, bool]]:
+        """Centerbody's total angle of attack, deg, normal acceleration, g, and whether it ended early, of each run."""
+        begun: dict[int, tuple[Start, Vehicle]] = {}
+
+        def start_of(k: int) -> Start:
+            begun[k] = self.start(runs[k])
+            return begun[k][0]
+
+        for flown in fly_ensemble(self.vehicle, start_of, range(len(runs)), self.schedule):
+            yield self._kept(flown, *begun.pop(flown.run))
 
     def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
         if not len(flown.aux):
