@@ -28,8 +28,6 @@ from postflight import run_folder
 from postflight.commands import compile_kernels, console, print_checks
 from postflight.deflections import camera_for_fusion
 from postflight.flight import RECONSTRUCT, Flight
-from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
-from postflight.plots.style import draw
 from postflight.reconciliation.fit import JointFit, mismatched_spans, require_damping, select_laws
 from postflight.reconciliation.fit import reconcile as fit_joint
 from postflight.reconciliation.forward_model import MOTION, SLOW_JOINT, integrable
@@ -50,7 +48,6 @@ from postflight.reconciliation.posterior import (
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.second_process import SecondProcess
 from postflight.streams import keep_arrays, on_one_thread
-from postflight.studies.commands import bands, compared_with_bounds
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
@@ -113,6 +110,8 @@ class Reconciliation(Tabular):
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
+        from postflight.studies.commands import compared_with_bounds  # matplotlib, for whoever only fits
+
         return compared_with_bounds(self.bet, rigid, flexible)[0]
 
     def to_frame(self) -> pd.DataFrame:
@@ -175,6 +174,11 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         report(0.9, "flying entries with the fitted joint")
         laws_flown, vehicle = dispersed(fit)
         second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
+        # a third of a second to import, while the other process flies
+        from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
+        from postflight.plots.style import draw
+        from postflight.studies.commands import bands, compared_with_bounds
+
         modal, no_modes = _modes(flight, fit)
         fused, rigid = second.answer()
         settings["output_rate_hz"] = flight.flight.settings.output_rate_hz
