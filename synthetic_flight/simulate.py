@@ -535,10 +535,12 @@ def kernel_tables(
     air = atmosphere if atmosphere.ndim == 3 else atmosphere[None]
     free = np.zeros(coefficients.shape[1:])
     if vehicle.aero.free_molecular is not None:
-        free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
+        gas = _gas_constants(air_from_m, air.shape[1])
         with np.errstate(divide="ignore"):  # no air: infinite mean free path
-            gas = _gas_constants(air_from_m, air.shape[1])
-            air[..., 5] = sphere_cone.bridge(mean_free_path(air[..., 0], gas) / vehicle.reference.length_m)
+            longest = mean_free_path(air[..., 0].min(), gas.min()) / vehicle.reference.length_m
+            if longest > sphere_cone.KN_CONTINUUM:  # in thicker air the room for the share stays zero
+                free, air = np.ascontiguousarray(vehicle.aero.free_molecular), air.copy()
+                air[..., 5] = sphere_cone.bridge(mean_free_path(air[..., 0], gas) / vehicle.reference.length_m)
     return np.ascontiguousarray(air), grid, np.ascontiguousarray(vehicle.aero.mach), coefficients, free
 
 

@@ -676,8 +676,8 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
 
 def _until_lost(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
     """States and auxiliaries of some flights, NaN from the first record on that is not finite."""
-    lost = ~np.isfinite(states).all(axis=2)
-    if lost.any():
+    if not np.isfinite(states[:, -1]).all():  # what is lost once stays so
+        lost = ~np.isfinite(states).all(axis=2)
         lost = np.logical_or.accumulate(lost, axis=1)
         states[lost], aux[lost] = np.nan, np.nan
     return states, aux
