@@ -287,9 +287,6 @@ def estimate(
     answer, and waited for while other methods run; without it the film is read. ``tested``: the same of the test of the
     camera's time bias.
     """
-    from postflight.filming import camera_answer
-    from postflight.fusing import fuse_flight
-
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
     answers = Deflections(bet=bet)
@@ -298,6 +295,8 @@ def estimate(
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
+                from postflight.filming import camera_answer
+
                 filmed = seen() or camera_answer(flight, bet, _part(report, k, len(methods)))
                 history = filmed.history
             elif bet is None:
@@ -307,6 +306,8 @@ def estimate(
             elif method == "trim":
                 history = estimate_trim(bet)
             else:
+                from postflight.fusing import fuse_flight
+
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
                 camera = filmed.plain if filmed is not None and used else None
