@@ -46,6 +46,9 @@ _LEAST_LINES = 40  # 2,000 pixels, by which a correlation scatters by 0.03
 # of 2,500 pairs of frames of 51 sound films, uncompressed, by JPEG and by H.264, 3.2 sd are the most; of 40 films mixed
 # by a tenth or more 5 to 15 sd, and correlations of 0.1 to 0.7
 _LEAST_SHARED, _LEAST_SD = 0.08, 5.0
+# of all pairs so far apart in a film: 2.2 to 3.2 sd at the most in 70 sound films; 6 to 10 sd, and correlations of 0.05
+# to 0.08, in films of which a picture is for nine tenths the one before
+_LEAST_THROUGHOUT = 0.03
 _DARK, _BRIGHT = 2, 251  # grey levels: clipped
 _SECOND = np.array([1.0, -2.0, 1.0])
 
@@ -138,7 +141,7 @@ def mixed_with(noises: Sequence[SurfaceNoise | None]) -> dict[int, tuple[int, fl
         return {}
     number, edge_px = np.array([k for k, _ in kept]), np.array([noise.edge_px for _, noise in kept])
     window = np.zeros((_BACK, *kept[0][1].levels.shape), dtype=np.float32)  # the last frames, over and over
-    power, pairs = np.zeros(edge_px.shape), []
+    power, rows = np.zeros(edge_px.shape), []
     for row, (k, noise) in enumerate(kept):
         levels = noise.levels.astype(np.float32)
         power[row] = np.einsum("nm,nm->n", levels, levels)
@@ -151,13 +154,28 @@ def mixed_with(noises: Sequence[SurfaceNoise | None]) -> dict[int, tuple[int, fl
         shared = np.einsum("bnm,nm->bn", window[before % _BACK], levels) * counted
         size = np.sqrt(np.einsum("bn,bn->b", power[before], counted) * (counted @ power[row]))
         # of independent noise the lines' sums are of either sign
-        over_sd = shared.sum(axis=1) / np.sqrt(np.einsum("bn,bn->b", shared, shared))
-        pairs += [(k, *pair) for pair in zip(number[before].tolist(), shared.sum(axis=1) / size, over_sd, strict=True)]
+        total, square = shared.sum(axis=1), np.einsum("bn,bn->b", shared, shared)
+        rows.append(np.column_stack([np.full(len(before), k), number[before], total, square, size]))
         window[row % _BACK] = levels
-    usual = max(float(np.quantile([correlation for _, _, correlation, _ in pairs], 0.25)), 0.0) if pairs else 0.0
+    return _sharing(np.concatenate(rows))
+
+
+def _sharing(pairs: FloatArray) -> dict[int, tuple[int, float]]:
+    """As `mixed_with`, of pairs of frames: later, earlier, and shared noise, sum of its squares and size of both."""
+    if not len(pairs):
+        return {}
+    (later, earlier), (total, square, size) = pairs[:, :2].T.astype(int), pairs[:, 2:].T
+    usual = max(float(np.quantile(total / size, 0.25)), 0.0)
+    beyond = total / size - usual
+    shares = (beyond > _LEAST_SHARED) & (total > _LEAST_SD * np.sqrt(square))
+    # a film may be mixed throughout: too little for a pair alone, but all pairs so far apart say so
+    by_lag = np.zeros((_BACK + 1, 3))
+    np.add.at(by_lag, later[~shares] - earlier[~shares], np.column_stack([total - usual * size, square, size])[~shares])
+    excess, squares, sizes = by_lag.T
+    throughout = (excess > _LEAST_THROUGHOUT * sizes) & (excess > _LEAST_SD * np.sqrt(squares))
+    shares |= throughout[later - earlier]
     found: dict[int, tuple[int, float]] = {}
-    for k, j, correlation, over_sd in pairs:
-        beyond = float(correlation) - usual
-        if beyond > max(_LEAST_SHARED, found.get(k, (0, 0.0))[1]) and over_sd > _LEAST_SD:
-            found[k] = (j, beyond)
+    for k, j, one in zip(later[shares].tolist(), earlier[shares].tolist(), beyond[shares].tolist(), strict=True):
+        if k not in found or one > found[k][1]:
+            found[k] = (j, one)
     return found

@@ -81,6 +81,17 @@ def test_a_sensors_own_pattern_is_no_mixture():
     assert mixed_with(noises).keys() == {7}
 
 
+def test_a_film_is_mixed_throughout_where_all_frames_so_far_apart_share_a_little():
+    """Nearly all of a picture is the frame's three before: too little for a pair alone, and all of them say so."""
+    noises = independent(12)
+    late = [blend(noises[k - 3], noise, 0.05) if k >= 3 else noise for k, noise in enumerate(noises)]
+    found = mixed_with(late)
+    assert {k: j for k, (j, _) in found.items()} == {k: k - 3 for k in range(6, 12)}
+    assert np.median([share for _, share in found.values()]) == pytest.approx(0.05, abs=0.02)
+    # in one such picture the shell lies where it lay in the frame before: nothing has moved between the two
+    assert not mixed_with([*noises[:7], late[7], *noises[8:]])
+
+
 def test_noise_is_the_second_difference_of_what_can_be_seen(frames, oriented):
     places, image = oriented.noise_places, frames[1].copy()
     fit = oriented.fit(image)
