@@ -16,7 +16,7 @@ from functools import wraps
 from typing import Any, ParamSpec, TextIO, TypeVar
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidi, zero width), half a character, line ends
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of malloc.h
 # a map of its own is cleared page by page whenever it is made: smaller arrays come and go all the time
 _LARGE_BYTES, _HELD_BYTES = 4 << 20, 64 << 20
 _LARGEST_KEPT_BYTES = 32 << 20  # more the C library does not take
@@ -120,7 +120,8 @@ def return_large_arrays(from_bytes: int = _LARGE_BYTES) -> None:
 
     The GNU C library by itself raises that size to the largest array that was freed so far (32 MB at most): those of a
     filter pass then lie on the heap, where what is left between them keeps 40 MB of a run. Of what is free at the end
-    of the heap it may hold `_HELD_BYTES`. Of another C library nothing is asked.
+    of the heap it may hold `_HELD_BYTES`. Threads share one heap: each of their own keeps as much, 40 MB of a run. Of
+    another C library nothing is asked.
     """
     from ctypes import CDLL
 
@@ -128,6 +129,7 @@ def return_large_arrays(from_bytes: int = _LARGE_BYTES) -> None:
         library = CDLL(None)
         library.mallopt(_M_MMAP_THRESHOLD, from_bytes)
         library.mallopt(_M_TRIM_THRESHOLD, _HELD_BYTES)
+        library.mallopt(_M_ARENA_MAX, 1)
 
 
 def keep_arrays() -> None:

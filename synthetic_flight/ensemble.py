@@ -224,7 +224,7 @@ class Records:
         latitude, longitude, _ = earth.geodetic_from_ecef(at)
         wind = np.zeros_like(velocity)
         for axis in (0, 1):
-            wind[:, axis] = np.interp(self.aux[:, 0], _TABLE_M, self.atmosphere[:, 3 + axis])
+            wind[:, axis] = np.interp(self.aux[:, 0], _TABLE_M[: len(self.atmosphere)], self.atmosphere[:, 3 + axis])
         wind_eci = np.einsum("nji,nj->ni", earth.dcm_ned_ecef(latitude, longitude), wind)
         return _turned_back(to_eci, velocity - wind_eci)
 

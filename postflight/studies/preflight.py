@@ -52,6 +52,8 @@ from synthetic_flight.weather import correlated
 
 START_ALTITUDE_M = 100e3
 RECORD_S, SPAN_S = 0.05, 70.0
+# up to 30 km above the start: no entry climbs so far, and blocks of flights have tables of their own
+AIR_ROWS = int((START_ALTITUDE_M + 30e3 - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M) + 1
 # steps of a slow vehicle; of a faster one so many that it turns by `STEP_RAD` in each: fourth-order steps then err by
 # 1e-6 rad
 RIGID_STEP_S, FLEXIBLE_STEP_S, STEP_RAD = RECORD_S / 3.0, 0.005, 0.15
@@ -207,7 +209,7 @@ class _Entry:
         velocity, omega = self.at_start.velocity_ecef_mps[0], self.at_start.omega_body_eci_body_radps[0]
         state = state_from_ecef(self.start_s, position, velocity, q, omega)
         parameters = simulate.parameter_vector(vehicle, *scales)
-        return Start(state, parameters, simulate.atmosphere_table(profile)), vehicle
+        return Start(state, parameters, simulate.atmosphere_table(profile)[:AIR_ROWS]), vehicle
 
     def fly(self, runs: list[tuple[int, int] | None]) -> Iterator[tuple[FloatArray, FloatArray, bool]]:
         """Centerbody's total angle of attack, deg, normal acceleration, g, and whether it ended early, of each run."""
