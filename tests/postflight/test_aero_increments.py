@@ -13,7 +13,7 @@ from estimators.increments import COEFFICIENTS, STATED
 from flightmodel.aerodynamics import read_with_sidecar, referred_to
 from flightmodel.checks import DivergenceError, Fault, GateError
 from flightmodel.vehicle import DATA, vehicle_from_toml
-from postflight import deflections
+from postflight import flown_coefficients
 from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.flown_coefficients import TABLE, increments_of
 from postflight.fusing import CameraTimeBias, fuse_flight
@@ -137,7 +137,7 @@ def test_without_increments_a_late_film_is_said_first(monkeypatch):
     def unsettled(*_):
         raise DivergenceError("they do not settle", code="increments-not-converged")
 
-    monkeypatch.setattr(deflections, "increments_of", unsettled)
+    monkeypatch.setattr(flown_coefficients, "increments_of", unsettled)
     settings = SimpleNamespace(check_confidence=CONFIDENCE)
     bet = SimpleNamespace(solution=SimpleNamespace(settings=settings), telemetry=SimpleNamespace(name="late"))
     late, on_time = (CameraTimeBias(offset, 0.01, False) for offset in (1.0, 0.0))
