@@ -176,7 +176,7 @@ GROUPS: dict[str, Callable[[], None]] = {
 }
 # what shares its parts: in one process these are compiled once. The longest first: they are dealt out in this order
 _FAMILIES = (
-    ("filter", "smoothers"), ("camera",), ("simulator", "ensembles", "creep"), ("balance",), ("spans",), ("tables",),
+    ("camera",), ("filter", "smoothers"), ("simulator", "ensembles", "creep"), ("balance",), ("spans",), ("tables",),
 )  # fmt: skip
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
