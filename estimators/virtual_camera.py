@@ -116,9 +116,9 @@ class VirtualCamera:
 
     @cached_property
     def across_picture(self) -> tuple[FloatArray, float]:
-        """Towards smaller clocking angles, to the right if upright: per px (2,), so that the picture's sides are at one
+        """How far a pixel lies towards smaller clocking angles, to the right if upright: one at the picture's sides.
 
-        from its middle, and what that gives for the middle.
+        Per px (2,), and what that gives for the picture's middle.
         """
         y, z = self.camera.position_body_m[1:]
         along = self.camera.dcm_cam_body[:2, 1:] @ np.array([-z, y])

@@ -458,6 +458,7 @@ def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
     """Estimate the deflection alone; the camera needs no trajectory, and is corrected where one can be made."""
+    from postflight.filming import by_camera
     from postflight.plots.overlay import write_overlay_film
     from postflight.plots.run_figures import draw_camera
 
@@ -491,8 +492,6 @@ def deflection(
                 history = answers.histories["camera"]
                 draw_camera(flight, history, out.path / "figures")
                 if film:
-                    from postflight.filming import by_camera
-
                     for name, (seen, own) in by_camera(telemetry, history).items():
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
                         write_overlay_film(seen, own, out.path / "figures" / file, progress=report)

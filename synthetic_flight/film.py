@@ -135,6 +135,7 @@ class ShellRenderer:
         rays[~in_field] = -camera.dcm_cam_body[1]
         self.rays = rays.reshape(h, w, 3)
         self.rays32 = self.rays.astype(np.float32)
+        self.few_rays = np.ascontiguousarray(self.rays[::2, ::2]).reshape(-1, 3)
         cosine = self.rays @ camera.dcm_cam_body[2]
         self.vignetting = np.where(in_field.reshape(h, w), 1.0 - vignetting * (1.0 - cosine), 0.0).astype(np.float32)
         self.sky = _sky(self.rays, camera)
@@ -202,8 +203,7 @@ class ShellRenderer:
         turn, eye, sun, shell, warp, body = in_shell
         (h, w), every = depth.shape, depth[::2, ::2]
         few = np.full(every.shape, np.nan)
-        few_rays = np.ascontiguousarray(self.rays[::2, ::2]).reshape(-1, 3)
-        _film_kernels.see_sun(few_rays, every.ravel(), turn, eye, sun, shell, warp, body, few.ravel())
+        _film_kernels.see_sun(self.few_rays, every.ravel(), turn, eye, sun, shell, warp, body, few.ravel())
         next_row, next_column = np.append(few[1:], few[-1:], axis=0), np.append(few[:, 1:], few[:, -1:], axis=1)
         across = np.append(next_row[:, 1:], next_row[:, -1:], axis=1)
         agree = ((few == 0.0) | (few == 1.0)) & (few == next_row) & (few == next_column) & (few == across)

@@ -161,8 +161,9 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
         require_damping(telemetry.required_vehicle())
         compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
-        second.ask(camera_for_fusion, Flight(telemetry))
-        flight = reconstruct(Flight(telemetry), progress=lambda f, what: report(0.02 + 0.18 * f, what))
+        measured = Flight(telemetry)
+        second.ask(camera_for_fusion, measured)
+        flight = reconstruct(measured, progress=lambda f, what: report(0.02 + 0.18 * f, what))
         second.ask(without_fit, flight, second.answer())
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
