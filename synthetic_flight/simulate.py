@@ -255,34 +255,40 @@ def integrate_into(
     schedule: Schedule,
     planet: earth.Planet = earth.WGS84,
     air_from_m: float = ATMOSPHERE_START_M,
+    lanes: int = 0,
 ) -> NDArray[np.int64]:
-    """`integrate_lanes` into ``out`` (lanes, records, 20 or 22) and ``aux`` (lanes, records, 18).
+    """`integrate_lanes` of m flights into ``out`` (m, records, 20 or 22) and ``aux`` (m, records, 18).
 
-    The first row of the atmosphere's table is at ``air_from_m``.
+    The first row of the atmosphere's table is at ``air_from_m``. So many ``lanes`` fly side by side, a divisor of m;
+    all by default.
 
     Returns
     -------
-    (lanes,) int
+    (m,) int
         Records that are written, negative where the joint diverged; what follows them is left as it was.
     """
-    lanes, _, width = out.shape
-    written = np.zeros(lanes, dtype=np.int64)
-    at.integrate(
-        (0,) * lanes,
-        (0,) * (width - STATES),
-        (0,) * int(parameters[:, at.TERMS :].any()),
-        workspace(states, parameters, schedule.step_s),
-        kernel_tables(vehicle, atmosphere, air_from_m),
-        planet,
-        schedule.step_s,
-        schedule.per_record,
-        schedule.records,
-        schedule.lock_records,
-        DEFLECTION_LIMIT_RAD,
-        out,
-        aux,
-        written,
-    )
+    flights, _, width = out.shape
+    lanes = lanes or flights
+    written = np.zeros(flights, dtype=np.int64)
+    kinds = (0,) * lanes, (0,) * (width - STATES), (0,) * int(parameters[:, at.TERMS :].any())
+    air, *tables = kernel_tables(vehicle, atmosphere, air_from_m)
+    spaces = workspace(states, parameters, schedule.step_s).reshape(at.ROWS, -1, lanes).transpose(1, 0, 2)
+    for number, space in enumerate(np.ascontiguousarray(spaces)):
+        block = slice(number * lanes, (number + 1) * lanes)
+        at.integrate(
+            *kinds,
+            space.ravel(),
+            (air[block] if len(air) > 1 else air, *tables),
+            planet,
+            schedule.step_s,
+            schedule.per_record,
+            schedule.records,
+            schedule.lock_records,
+            DEFLECTION_LIMIT_RAD,
+            out[block],
+            aux[block],
+            written[block],
+        )
     return written
 
 

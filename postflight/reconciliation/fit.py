@@ -58,6 +58,7 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.gauss_newton import (
     INSTRUMENTS,
+    KINKED,
     Linearization,
     Parameters,
     Problem,
@@ -73,9 +74,9 @@ SD_FACTORS_EARLY = (30.0, 10.0, 3.0)
 MOST_STEPS = 20  # after the early ones
 # predicted decrease of the cost at which a fit ends: the last one, and the one before the turbulence is estimated
 TOLERANCE, EARLY_TOLERANCE = 0.05, 2.0
-# the coefficient table has kinks at its Mach numbers: in one of them the cost is lowest whatever its slopes predict. So
-# a fit ends, too, where no step lowers the cost by more than `STILL` and the slopes promise less than one sd
-STILL, KINKED = 0.01, 1.0
+# in a kink of the coefficient table the cost is lowest whatever its slopes predict. So a fit ends, too, where no step
+# lowers the cost by more than `STILL` and the slopes promise less than one sd (`KINKED`)
+STILL = 0.01
 SETTLED_SD, CORRECTIONS = 0.1, 3  # of what finer integration steps would move; how often it is corrected
 # of freeplay: factors on standard deviations, and half width of the band's corners over the freeplay
 CONTINUATION = ((30.0, 1.0), (10.0, 0.5), (3.0, 0.3), (3.0, 0.1), (1.0, 0.1), (1.0, 0.05))

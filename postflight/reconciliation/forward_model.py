@@ -343,6 +343,7 @@ WINDOWS = 10  # a span
 SPAN_S = WINDOWS * WINDOW_S
 SPAN_MARGIN_M = 200.0  # of the air about a span, beside what it falls through
 LEAST_SPANS = 20
+LARGEST_PART, LEAST_PARTS = 16, 8  # blocks that a thread flies in a row, of about three spans; of few flights
 LOADED = 0.1  # of the largest dynamic pressure
 # a priori sd of deflection and its rate (about x, y, z) at the first start: at rest above the atmosphere; under load
 REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
@@ -643,35 +644,37 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
     arms, masses = np.array([measured.accelerometer_m - b.cg_m for b in bodies]), np.array([b.mass_kg for b in bodies])
     windows, slope = np.empty((2, len(starts), WINDOWS, 6))
     attitudes, ends = np.empty((len(starts), WINDOWS, 8)), np.empty_like(starts)
+    schedule, simpson = simulate.Schedule(steps.step_s, steps.per_record, steps.records), steps.simpson
 
-    def fly(begin: int) -> None:
-        block = slice(begin, min(begin + LANES, len(starts)))
-        which = np.minimum(np.arange(begin, begin + LANES), len(starts) - 1)
-        rows = slice(int(first[block].min()), int(last[block].max()))
-        states, aux = (np.full((LANES, steps.records, n), np.nan) for n in (starts.shape[1], simulate.AUX))
+    def fly(part: slice) -> None:
+        count = part.stop - part.start
+        which = np.minimum(np.arange(part.start, part.start - count // -LANES * LANES), part.stop - 1)
+        rows = slice(int(first[part].min()), int(last[part].max()))
+        states, aux = (np.full((len(which), steps.records, n), np.nan) for n in (starts.shape[1], simulate.AUX))
         simulate.integrate_into(
             states, aux, vehicle, flights.air_of(which, rows), starts[which], parameters[flights.vehicle[which]],
-            simulate.Schedule(steps.step_s, steps.per_record, steps.records),
-            air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M,
+            schedule, air_from_m=simulate.ATMOSPHERE_START_M + rows.start * simulate.ATMOSPHERE_STEP_M, lanes=LANES,
         )  # fmt: skip
-        states, aux = _until_lost(states[: block.stop - begin], aux[: block.stop - begin])
-        numbers = np.ascontiguousarray(flights.vehicle[block])  # or the kernel would be compiled for both
-        _span_kernels.sense(
-            states, aux, numbers, arms, masses, steps.simpson, WINDOW_S, windows[block], slope[block]
-        )  # fmt: skip
-        attitudes[block] = states[:, steps.intervals // 2 :: steps.intervals, 6:14]
-        ends[block] = states[:, -1]
-
-    def fly_blocks(begins: Index) -> None:
-        for begin in begins.tolist():
-            fly(begin)
+        states, aux = _until_lost(states[:count], aux[:count])
+        numbers = np.ascontiguousarray(flights.vehicle[part])  # or the kernel would be compiled for both
+        _span_kernels.sense(states, aux, numbers, arms, masses, simpson, WINDOW_S, windows[part], slope[part])
+        attitudes[part] = states[:, steps.intervals // 2 :: steps.intervals, 6:14]
+        ends[part] = states[:, -1]
 
     with ThreadPoolExecutor(available_cores()) as pool:
-        blocks = range(0, len(starts), LANES)
-        # a few tasks each: handing over a block takes as long as flying it
-        parts = np.array_split(blocks, min(len(blocks), 4 * available_cores()))
-        list(pool.map(fly_blocks, parts))
+        list(pool.map(fly, _parts(len(starts))))
     return PredictedSpans(windows, slope, attitudes, _ends(measured, flights, ends))
+
+
+def _parts(flights: int) -> list[slice]:
+    """Parts of the flights that one thread flies in a row, of whole blocks of lanes.
+
+    Handing over a block takes as long as flying it; a large part's air reaches over many spans. The same on every
+    machine: where a part's air begins is seen in the last bits.
+    """
+    blocks = -(-flights // LANES)
+    size = LANES * min(LARGEST_PART, -(-blocks // LEAST_PARTS))
+    return [slice(begin, min(begin + size, flights)) for begin in range(0, flights, size)]
 
 
 def _until_lost(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -303,16 +303,16 @@ class Problem:
         return replace(flown, windows=flown.windows + self.step_error.windows, end=end)
 
     def _flown(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
-        """Spans of several parameters by the problem's own steps."""
-        spans = self.measured.spans
-        number = np.repeat(np.arange(len(trials)), spans)
+        """Spans of several parameters by the problem's own steps, each span's side by side: they share its air."""
+        spans, count = self.measured.spans, len(trials)
+        number = np.tile(np.arange(count), spans)
         air, *others = [self.air.table(u.air, u.warmer_k) for u in trials]
         flights = SpanFlights(
-            np.tile(np.arange(spans), len(trials)), number, np.concatenate([u.motion for u in trials]), number,
-            [self.trial_vehicle(u.vehicle) for u in trials], air, [MovedRows(0, table) for table in others],
+            np.repeat(np.arange(spans), count), number, np.concatenate(np.stack([u.motion for u in trials], axis=1)),
+            number, [self.trial_vehicle(u.vehicle) for u in trials], air, [MovedRows(0, table) for table in others],
         )  # fmt: skip
         flown = fly_spans(self.measured, self.vehicle_parameters.nominal, flights)
-        return [flown.part(slice(k * spans, (k + 1) * spans)) for k in range(len(trials))]
+        return [flown.part(slice(k, None, count)) for k in range(count)]
 
     def instrument_response(self, predicted: PredictedSpans) -> FloatArray:
         """Response of the windows to the instruments' parameters, (s, WINDOWS, 6, 20).
@@ -516,6 +516,9 @@ LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
 # shares of the diagonal that are added, until the cost falls by a fair part of the undamped step's predicted decrease
 DAMPINGS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 FIRST_DAMPING, MOST_DAMPING, FAIR = 1e-2, 1e3, 0.5
+# predicted decrease by a step of one sd in all. A shorter one is not damped while it lowers the cost at all: what is
+# left of its prediction is the coefficient table's kinks at its Mach numbers, which no damping takes away
+KINKED = 1.0
 
 
 @dataclass(frozen=True)
@@ -549,7 +552,7 @@ def step_from(problem: Problem, u: Parameters) -> Step:
     best = linear.residuals, u
     for damping in DAMPINGS:
         best = _better(problem, u, linear, normal, damping, best)
-        if linear.residuals.cost - best[0].cost > FAIR * predicted_decrease:
+        if linear.residuals.cost - best[0].cost > FAIR * predicted_decrease or predicted_decrease < KINKED:
             break
     damping = FIRST_DAMPING
     while best[0].cost >= linear.residuals.cost and damping < MOST_DAMPING:
