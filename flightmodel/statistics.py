@@ -19,7 +19,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import gammaincinv
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import BoolArray, FloatArray
 
 NORMAL_MAD = 1.4826  # sd of a normal variable over the median of its absolute values
 KNOTS_A_LENGTH = 3  # of a Gauss-Markov history, in one correlation length
@@ -166,3 +166,12 @@ def jackknife_variance(without: FloatArray) -> FloatArray:
 def percentile_band(values: FloatArray, axis: int = 0) -> FloatArray:
     """Lower limit, median and upper limit of an ensemble along ``axis``, first in the result (`BAND_PERCENTILES`)."""
     return np.asarray(np.percentile(values, BAND_PERCENTILES, axis=axis))
+
+
+def inside(
+    time_s: FloatArray, values: FloatArray, band_time_s: FloatArray, low: FloatArray, high: FloatArray
+) -> BoolArray:
+    """Mask (n,) of values at times (n,) between two limits that are given at other times."""
+    return np.asarray(
+        (values >= np.interp(time_s, band_time_s, low)) & (values <= np.interp(time_s, band_time_s, high))
+    )

@@ -17,12 +17,11 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.statistics import chi_square_quantile
+from flightmodel.statistics import chi_square_quantile, inside
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
-from postflight.studies.preflight import inside
 from recon.measurements import component_unit
 
 _TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000

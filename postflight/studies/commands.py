@@ -14,6 +14,7 @@ from rich.table import Table
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.statistics import inside
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
@@ -24,7 +25,7 @@ from postflight.plots.style import draw
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1
-from postflight.studies.preflight import Bounds, entry_bounds, inside
+from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.studies.shell_test import fit_laws, read_load_test
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION

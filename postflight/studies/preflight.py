@@ -24,7 +24,7 @@ import pandas as pd
 from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
-from flightmodel.checks import BoolArray, FloatArray, GateError, Progress
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import percentile_band
 from flightmodel.trajectory import resample
@@ -158,15 +158,6 @@ def entry_bounds(
         nominal_normal_g=normal[0],
         flights=flights,
         ended=ended,
-    )
-
-
-def inside(
-    time_s: FloatArray, values: FloatArray, band_time_s: FloatArray, low: FloatArray, high: FloatArray
-) -> BoolArray:
-    """Mask (n,) of values at times (n,) between two limits that are given at other times."""
-    return np.asarray(
-        (values >= np.interp(time_s, band_time_s, low)) & (values <= np.interp(time_s, band_time_s, high))
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from flightmodel import earth, rotations
+from flightmodel import earth, rotations, statistics
 from flightmodel.airdata import Inputs, _path_angles, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.earth import undulation_m
@@ -279,7 +279,7 @@ def test_coverage_counts_one_and_two_standard_deviations():
 
 def test_inside_a_band_is_between_its_limits():
     t = np.array([0.0, 1.0])
-    got = preflight.inside(
+    got = statistics.inside(
         np.array([0.5] * 3), np.array([0.4, 1.0, 2.6]), t, np.array([0.0, 1.0]), np.array([2.0, 3.0])
     )
     assert got.tolist() == [False, True, False]

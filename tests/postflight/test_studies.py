@@ -9,12 +9,13 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_atmosphere
 from flightmodel.checks import ConfigError
+from flightmodel.statistics import inside
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.flight import read_flight
 from postflight.montecarlo.study import read_study
 from postflight.reconstruction import reconstruct
 from postflight.studies import commands, joints
-from postflight.studies.preflight import dispersions_of, entry_bounds, inside
+from postflight.studies.preflight import dispersions_of, entry_bounds
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Window
 from synthetic_flight.ensemble import Records, Start, fly_legs, legs
