@@ -174,10 +174,11 @@ GROUPS: dict[str, Callable[[], None]] = {
     "tables": _tables,
     "spans": _spans,
 }
-# what shares its parts: in one process these are compiled once. The longest first: they are dealt out in this order
-_FAMILIES = (
-    ("camera",), ("filter", "smoothers"), ("simulator", "ensembles", "creep"), ("balance",), ("spans",), ("tables",),
-)  # fmt: skip
+# what shares its parts: in one process these are compiled once. With the seconds that it takes; only ratios count
+_FAMILIES: dict[tuple[str, ...], int] = {
+    ("filter", "smoothers"): 18, ("camera",): 18, ("simulator", "ensembles", "creep"): 8, ("balance",): 3,
+    ("tables",): 2, ("spans",): 2,
+}  # fmt: skip
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
 
@@ -234,15 +235,17 @@ def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
 
 
 def _shares(groups: list[str], processes: int) -> list[list[str]]:
-    """Deal groups, family by family, back and forth; what is in none is a family of its own."""
+    """Deal groups, family by family, each to whom has the least to do; what is in none is a family of its own."""
     known = {group for family in _FAMILIES for group in family}
-    families = [*([g for g in family if g in groups] for family in _FAMILIES), *([g] for g in groups if g not in known)]
-    families = [family for family in families if family]
-    shares: list[list[str]] = [[] for _ in range(min(processes, len(families)))]
-    for k, family in enumerate(families):
-        turn, place = divmod(k, len(shares))
-        shares[place if turn % 2 == 0 else -1 - place] += family
-    return shares
+    families = [*_FAMILIES.items(), *(((group,), 1) for group in groups if group not in known)]
+    shares: list[list[str]] = [[] for _ in range(processes)]
+    load = [0] * processes
+    for family, seconds in families:
+        if wanted := [group for group in family if group in groups]:
+            least = load.index(min(load))
+            shares[least] += wanted
+            load[least] += seconds
+    return [share for share in shares if share]
 
 
 def _compile(groups: Iterable[str]) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from postflight import warmup
 from tests.refusing import printed_codes
 
 COUNT = """
@@ -60,6 +61,15 @@ def test_what_is_missing_is_compiled_once_and_reported(tmp_path):
     assert "tables" in first.stdout
     assert [p.name.split("-")[0] for p in (tmp_path / "cache").rglob("*.compiled")] == ["tables"]
     assert (again.returncode, again.stdout) == (0, ""), again.stderr
+
+
+def test_every_group_is_dealt_once_whatever_the_processors():
+    for processors in (1, 2, 3, 16):
+        shares = warmup._shares(list(warmup.GROUPS), processors)
+        assert sorted(group for share in shares for group in share) == sorted(warmup.GROUPS)
+        assert len(shares) <= processors
+    with_parts = next(share for share in shares if "ensembles" in share)
+    assert {"simulator", "creep"} <= set(with_parts)  # which has the same parts
 
 
 def test_a_group_that_fails_is_reported_with_its_reason(tmp_path):
