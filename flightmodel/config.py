@@ -79,7 +79,8 @@ class Section(BaseModel):
     Whole numbers pass where a number is wanted; true, false and text do not.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # built at first use: a command reads few of the tables that it imports
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True)
 
     @field_validator("*", mode="before")
     @classmethod

@@ -266,3 +266,4 @@ def _compile(groups: Iterable[str]) -> None:
 
 if __name__ == "__main__":
     _compile(sys.argv[1:])
+    gc.freeze()  # or all that was made is searched for garbage once more at the end
