@@ -685,7 +685,7 @@ def _write_images(frames: Iterable[Image], folder: Path) -> Iterable[str]:
     for k, frame in enumerate(frames):
         name = f"frame_{k:05d}.png"
         # through Python's own file, which raises on a full disk
-        (folder / name).write_bytes(cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes())
+        (folder / name).write_bytes(cv2.imencode(".png", frame)[1].tobytes())
         yield name
 
 
