@@ -291,6 +291,24 @@ def project_shell(points, terms, lens, pixels, jacobian):
 
 
 @kernel
+def project_each(points, deformations, shell, lenses, pixels):
+    """Pixels (m, n, 2) of points (n, 3) for m deformations (m, 3) and m lenses; one deformation or lens serves all.
+
+    ``shell``: joint station, station and radius of the ring; ``lenses``: as of `project_points`, arrays by lens first.
+    """
+    model, half_field, focal, centre, k, position, axes = lenses
+    joint, ring_station, ring_radius = shell
+    rotation, left = np.empty((3, 3)), np.empty((3, 2))
+    for one in range(len(pixels)):
+        d, c = one % len(deformations), one % len(axes)
+        rotation_of(deformations[d, 0], deformations[d, 1], rotation, left)
+        terms = (rotation, left, joint, deformations[d, 2], ring_station, ring_radius)
+        lens = (model, half_field[c], focal[c], centre[c], k[c], position[c], axes[c])
+        for i in range(len(points)):
+            pixels[one, i, 0], pixels[one, i, 1] = pixel_of(points[i], terms, lens)
+
+
+@kernel
 def limb(circles, ring, flat, eye, clocks, points):
     """`limb_points` for callers in Python."""
     return limb_points(circles, ring, flat, eye, clocks, points)

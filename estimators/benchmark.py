@@ -72,7 +72,7 @@ from estimators.loads import FlightLoads
 from estimators.texture import texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
 from flightmodel import rotations
-from flightmodel.camera import camera_from_mount
+from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
@@ -422,10 +422,11 @@ def _pose_of_feature_map(
     points = painted.points_shell_m
     if len(points) == 0:
         return None
-    at_rest = np.zeros(3)
 
-    def pixels(lens: FloatArray) -> FloatArray:
-        return _posed(nominal, np.concatenate([lens, np.zeros(_POSES - len(lens))])).sight(points, at_rest).pixels
+    def pixels(drawn: FloatArray) -> FloatArray:
+        poses = np.pad(drawn, ((0, 0), (0, _POSES - drawn.shape[1])))
+        lenses = nominal.camera.terms_of_turned(poses[:, :3], 1.0 + poses[:, 3], **_moved_lens(nominal.camera, poses))
+        return nominal.pixels_of_each(points, np.zeros((1, 3)), lenses)
 
     # the focal length is what may be far off: it is searched in pieces
     sd = prior[:8].copy()
@@ -447,17 +448,19 @@ def _prior_sd(camera: CameraUncertainty, apriori: AprioriSd) -> FloatArray:
 
 
 def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
-    camera = nominal.camera
-    lens = camera.distortion.copy()
-    lens[:2] += pose[6:8]
-    moved = camera.turned(
-        pose[:3],
-        1.0 + pose[3],
-        centre_px=camera.centre_px + pose[4:6],
-        distortion=lens,
-        position_body_m=camera.position_body_m + pose[8:11],
-    )
+    moved = nominal.camera.turned(pose[:3], 1.0 + pose[3], **_moved_lens(nominal.camera, pose))
     return replace(nominal, camera=moved)
+
+
+def _moved_lens(camera: Camera, pose: FloatArray) -> dict[str, FloatArray]:
+    """What else than rotation and focal scale poses (..., 12) change of a camera."""
+    k1_k2 = np.zeros((*pose.shape[:-1], len(camera.distortion)))
+    k1_k2[..., :2] = pose[..., 6:8]
+    return {
+        "centre_px": camera.centre_px + pose[..., 4:6],
+        "distortion": camera.distortion + k1_k2,
+        "position_body_m": camera.position_body_m + pose[..., 8:11],
+    }
 
 
 def _look(

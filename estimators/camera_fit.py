@@ -387,7 +387,7 @@ class OrientedCamera(FrameModel):
         """Deformation (3,) at which features fit the frame best, where that is significant."""
 
         def pixels(turned: FloatArray) -> FloatArray:
-            return self.view.sight(painted.points_shell_m, np.array([*turned, 0.0])).pixels
+            return self.view.pixels_of_each(painted.points_shell_m, np.pad(turned, ((0, 0), (0, 1))))
 
         fitted = fit_feature_map(image, pixels, [start[:2].copy()], _FAR_RAD, painted.signs)
         if fitted is not None:

@@ -52,7 +52,7 @@ from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 Pixels = Callable[[FloatArray], FloatArray]
-"""From parameters ``(k,)`` to the features' pixels ``(n, 2)``, NaN outside the lens's field."""
+"""From many parameters ``(m, k)`` to the features' pixels ``(m, n, 2)``, NaN outside the lens's field."""
 
 _LEAST_FACING = 0.3  # cosine: seen flatter a feature has less than a third of its width
 _HALF_SEAM_M, _HALF_DOT_M = 0.006, 0.011  # as `flightmodel.geometry` draws them; a list states its own
@@ -383,14 +383,13 @@ def fit_feature_map(
             drawn[0] = centre
             # not beyond the prior, where all features may come together on one dark spot
             drawn = np.clip(drawn, start - _FARTHEST_SD * sd, start + _FARTHEST_SD * sd)
-            values = np.array([one.score(pixels(p)) for p in drawn])
-            best = drawn[np.argsort(-values)[:_ELITE]]
+            best = drawn[np.argsort(-one.scores(pixels(drawn)))[:_ELITE]]
             centre, spread = best.mean(axis=0), np.maximum(best.std(axis=0), _NARROWEST * sd)
-        found.append((maps[-1].score(pixels(centre)), centre))
+        found.append((float(maps[-1].scores(pixels(centre[None]))[0]), centre))
     highest, where = max(found, key=lambda pair: pair[0])
-    others = [maps[-1].score(pixels(p)) for p in starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))]
+    others = maps[-1].scores(pixels(starts[0] + sd * rng.standard_normal((_OTHERS, len(sd)))))
     usual = float(np.median(others))
-    scatter = NORMAL_MAD * float(np.median(np.abs(np.array(others) - usual)))
+    scatter = NORMAL_MAD * float(np.median(np.abs(others - usual)))
     return where if highest - usual > _LEAST_RISE * scatter else None
 
 
@@ -402,11 +401,13 @@ class _Map:
     means: FloatArray
     which: NDArray[np.int64]
 
-    def score(self, pixels: FloatArray) -> float:
-        """Mean over features at pixels (n, 2); those outside the picture count as its mean."""
+    def scores(self, pixels: FloatArray) -> FloatArray:
+        """Means (m,) over features at pixels (m, n, 2); those outside the picture count as its mean."""
         h, w = self.pictures.shape[1:]
-        at = np.nan_to_num(pixels, nan=-1.0)
-        u, v = np.rint(at).astype(int).T
+        u, v = np.moveaxis(np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(int), -1, 0)
         inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
-        total = self.pictures[self.which[inside], v[inside], u[inside]].sum() + self.means[self.which[~inside]].sum()
-        return float(total) / len(at)
+        # in one look-up, those outside at any pixel
+        seen = self.pictures[self.which, np.where(inside, v, 0), np.where(inside, u, 0)]
+        outside = self.means[self.which]
+        totals = [dark[here].sum() + outside[~here].sum() for dark, here in zip(seen, inside, strict=True)]
+        return np.array(totals, dtype=float) / pixels.shape[1]

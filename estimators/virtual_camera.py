@@ -28,7 +28,7 @@ import numpy as np
 
 from estimators import _sight_kernels
 from estimators.edge import HorizonLine, ScanLines
-from flightmodel.camera import Camera
+from flightmodel.camera import Camera, LensTerms
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, edge_circles, torus_circles
@@ -171,6 +171,22 @@ class VirtualCamera:
             np.ascontiguousarray(points_shell_m), self.terms(deformation), self.camera.lens_terms, pixels, jacobian
         )
         return Sight(pixels, jacobian)
+
+    def pixels_of_each(
+        self, points_shell_m: FloatArray, deformations: FloatArray, lenses: LensTerms | None = None
+    ) -> FloatArray:
+        """Pixels (m, n, 2) of points (n, 3) for each of many deformations (m, 3) or cameras; NaN outside a field.
+
+        ``lenses``: of `Camera.terms_of_turned`, m or one for all deformations; None: this camera's. One deformation
+        serves all lenses.
+        """
+        if lenses is None:
+            model, half, focal, centre, k, position, axes = self.camera.lens_terms
+            lenses = model, np.array([half]), focal[None], centre[None], k[None], position[None], axes[None]
+        pixels = np.empty((max(len(deformations), len(lenses[-1])), len(points_shell_m), 2))
+        shell = (self.joint_station_m, *self._ring)
+        _sight_kernels.project_each(np.ascontiguousarray(points_shell_m), deformations, shell, lenses, pixels)
+        return pixels
 
     def edge(self, deformation: FloatArray) -> ProjectedEdge:
         """Project the shell's edge for a deformation (3,); see `sight`.

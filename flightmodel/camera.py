@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 Lens = Literal["fisheye", "pinhole"]
+LensTerms = tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 LENSES: tuple[Lens, ...] = ("fisheye", "pinhole")
 
 WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
@@ -92,15 +93,13 @@ class Camera:
         dcm = self.dcm_cam_body
         if (np.abs(dcm @ dcm.T - np.eye(3)) > _SKEWNESS).any() or np.linalg.det(dcm) < 0.0:
             raise GateError("camera.dcm_cam_body: not a rotation matrix", code="camera-rotation")
-        object.__setattr__(self, "half_field_rad", one_to_one_half_angle_rad(self.distortion, self.lens))
+        object.__setattr__(self, "half_field_rad", float(one_to_one_half_angle_rad(self.distortion, self.lens)))
 
     @cached_property
     def lens_terms(self) -> tuple[int, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """What a compiled projection wants: see `estimators._sight_kernels.project_shell`."""
-        coefficients = np.zeros(5)
-        coefficients[: len(self.distortion)] = self.distortion
-        axes = np.ascontiguousarray(self.dcm_cam_body)
-        model = LENSES.index(self.lens)
+        axes, model = np.ascontiguousarray(self.dcm_cam_body), LENSES.index(self.lens)
+        coefficients = _five(self.distortion)
         return model, self.half_field_rad, self.focal_px, self.centre_px, coefficients, self.position_body_m, axes
 
     @cached_property
@@ -213,8 +212,30 @@ class Camera:
         ``v_cam_new = exp(rotation) v_cam``: a positive rotation about camera y (down) moves the scene to the right.
         Other fields are replaced by those that are given.
         """
+        axes = self._turned_axes(rotation_cam_rad)
+        return replace(self, dcm_cam_body=axes, focal_px=self.focal_px * focal_scale, **other)
+
+    def terms_of_turned(
+        self, rotation_cam_rad: FloatArray, focal_scale: FloatArray, *, centre_px: FloatArray, distortion: FloatArray,
+        position_body_m: FloatArray,
+    ) -> LensTerms:  # fmt: skip
+        """`lens_terms` of many cameras, as `turned` makes one of each row of its arguments, without their checks.
+
+        Parameters
+        ----------
+        rotation_cam_rad : (m, 3) float
+        focal_scale : (m,) float
+        centre_px : (m, 2) float
+        distortion : (m, k) float
+        position_body_m : (m, 3) float
+        """
+        half, focal = one_to_one_half_angle_rad(distortion, self.lens), self.focal_px * focal_scale[:, None]
+        axes, model = self._turned_axes(rotation_cam_rad), LENSES.index(self.lens)
+        return model, half, focal, centre_px, _five(distortion), position_body_m, axes
+
+    def _turned_axes(self, rotation_cam_rad: FloatArray) -> FloatArray:
         turn = rotations.dcm_from_q(rotations.exp(np.asarray(rotation_cam_rad, dtype=float)))
-        return replace(self, dcm_cam_body=turn @ self.dcm_cam_body, focal_px=self.focal_px * focal_scale, **other)
+        return np.asarray(turn @ self.dcm_cam_body)
 
     def sampled(self, samples: int) -> Camera:
         """Return this camera with so many samples along each side of a pixel, those of one pixel about its middle."""
@@ -267,18 +288,32 @@ def _lens_slope(angle_rad: FloatArray | float, distortion: FloatArray) -> FloatA
     return out
 
 
-def one_to_one_half_angle_rad(distortion: FloatArray, lens: Lens = "fisheye") -> float:
-    """Largest angle from the optical axis up to which the lens spreads what it sees, at most 89 deg, rad."""
-    angle = _ANGLES_RAD
-    if lens == "fisheye":
-        slope = _lens_slope(angle, distortion)
-    else:
-        k1, k2 = distortion[:2]
-        k3 = distortion[4] if len(distortion) > 4 else 0.0
-        r2 = np.tan(angle) ** 2
-        slope = 1.0 + r2 * (3 * k1 + r2 * (5 * k2 + r2 * 7 * k3))
-    falling = slope <= 1e-3
-    return float(angle[max(int(np.argmax(falling)) - 1, 0)]) if falling.any() else WIDEST_HALF_ANGLE_RAD
+def _five(distortion: FloatArray) -> FloatArray:
+    """Coefficients (..., 5) of a lens that may have fewer."""
+    out = np.zeros((*distortion.shape[:-1], 5))
+    out[..., : distortion.shape[-1]] = distortion
+    return out
+
+
+def _slopes(distance: FloatArray, radial: list[int]) -> FloatArray:
+    """What unit coefficients (5,) add to a lens's slope, of which ``radial`` those of even powers of a distance are."""
+    out = np.zeros((5, len(distance)))
+    for half_power, row in enumerate(radial, start=1):
+        out[row] = (2 * half_power + 1) * distance ** (2 * half_power)
+    return out
+
+
+_SLOPES = {"fisheye": _slopes(_ANGLES_RAD, [0, 1, 2, 3]), "pinhole": _slopes(np.tan(_ANGLES_RAD), [0, 1, 4])}
+
+
+def one_to_one_half_angle_rad(distortion: FloatArray, lens: Lens = "fisheye") -> FloatArray:
+    """Largest angles (...) from the optical axis up to which lenses spread what they see, at most 89 deg, rad.
+
+    ``distortion``: (..., k).
+    """
+    falling = 1.0 + _five(distortion) @ _SLOPES[lens] <= 1e-3
+    before = _ANGLES_RAD[np.maximum(falling.argmax(axis=-1) - 1, 0)]
+    return np.where(falling.any(axis=-1), before, WIDEST_HALF_ANGLE_RAD)
 
 
 def angle_from_lens_distance(distance: FloatArray, distortion: FloatArray, half_field_rad: float) -> FloatArray:

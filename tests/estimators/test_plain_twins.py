@@ -1,5 +1,7 @@
 """Compiled looks at pictures against plain ones, on points and scenes small enough to run interpreted."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -93,6 +95,31 @@ def test_projection_and_all_its_derivatives_are_those_of_the_plain_one(lens):
         slope = (up - down) / (2.0 * step)
         size = max(1.0, np.abs(slope).max())
         np.testing.assert_allclose(sight.jacobian[:, :, column], slope, atol=3e-6 * size, err_msg=str(column))
+
+
+@pytest.mark.parametrize("lens", ["fisheye", "pinhole"])
+def test_many_deformations_and_cameras_are_projected_as_each_by_itself(lens):
+    view, points = view_of(lens), np.concatenate([some_points(), [[-2.5, 0.4, 0.1]]])  # the last behind the lens
+    deformations = DEFORMATION * np.array([[1.0], [-0.6], [0.0]])
+    by_deformation = view.pixels_of_each(points, deformations)
+    turn, scale = np.array([[0.05, 0.0, -0.1], [0.0, -0.03, 0.2]]), np.array([1.02, 0.97])
+    given = {
+        "centre_px": view.camera.centre_px + np.array([[3.0, 0.0], [0.0, -2.0]]),
+        "distortion": view.camera.distortion + np.array([[0.01], [-0.02]]),
+        "position_body_m": view.camera.position_body_m + np.array([[0.01, 0.0, 0.0], [0.0, 0.0, 0.02]]),
+    }
+    by_camera = view.pixels_of_each(points, DEFORMATION[None], view.camera.terms_of_turned(turn, scale, **given))
+    others = [
+        replace(view, camera=view.camera.turned(turn[k], scale[k], **{n: every[k] for n, every in given.items()}))
+        for k in range(2)
+    ]
+    assert np.isnan(by_deformation[:, -1]).all()
+    assert np.isfinite(by_deformation[:, :-1]).all()
+    want = [view.sight(points, one).pixels for one in deformations]
+    np.testing.assert_allclose(by_deformation, want, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(
+        by_camera, [one.sight(points, DEFORMATION).pixels for one in others], rtol=0.0, atol=1e-9
+    )
 
 
 def test_edge_of_a_torus_is_where_sight_touches_it():

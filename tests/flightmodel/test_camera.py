@@ -143,6 +143,29 @@ def test_a_positive_turn_about_camera_y_moves_the_scene_right(camera):
     np.testing.assert_allclose(moved, [[0.01 * camera.focal_px[0], 0.0]], atol=1e-4)  # third order in 0.01
 
 
+@pytest.mark.parametrize("lens", ["fisheye", "pinhole"])
+def test_terms_of_many_turned_cameras_are_those_of_each(camera, lens):
+    if lens == "pinhole":
+        camera = replace(camera, lens=lens, distortion=np.array([-0.05, 0.01, 1e-3, -7e-4, 0.002]))
+    rng = np.random.default_rng(3)
+    turn, scale = 0.2 * rng.standard_normal((6, 3)), 1.0 + 0.05 * rng.standard_normal(6)
+    centre = camera.centre_px + rng.standard_normal((6, 2))
+    # the first ones fold within the field
+    distortion = camera.distortion + np.linspace(-0.4, 0.0, 6)[:, None] * np.eye(len(camera.distortion))[0]
+    position = camera.position_body_m + 0.01 * rng.standard_normal((6, 3))
+    model, *terms = camera.terms_of_turned(
+        turn, scale, centre_px=centre, distortion=distortion, position_body_m=position
+    )
+    assert len(set(terms[0])) > 2
+    for k in range(6):
+        one = camera.turned(
+            turn[k], scale[k], centre_px=centre[k], distortion=distortion[k], position_body_m=position[k]
+        )
+        assert model == one.lens_terms[0]
+        for many, own in zip(terms, one.lens_terms[1:], strict=True):
+            np.testing.assert_allclose(many[k], own, rtol=0.0, atol=1e-15)
+
+
 def test_a_camera_that_is_no_camera_is_refused(camera):
     with refuses("camera-rotation"):
         replace(camera, dcm_cam_body=np.diag([1.0, 1.0, -1.0]))
