@@ -37,6 +37,7 @@ from scipy.special import chdtrc
 
 from estimators.agreement import CONFIDENCE, agreement
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections
+from estimators.deflection_spline import inverse
 from estimators.evidence import (
     CAMERA_PLANE,
     CAMERA_TIME_BIAS,
@@ -45,7 +46,7 @@ from estimators.evidence import (
     evidence_of_readings,
     moved_evidence,
 )
-from estimators.fusion import LEAST_SAMPLES, Fused, Inputs, fuse, with_unresolved_swing
+from estimators.fusion import LEAST_SAMPLES, Fused, Inputs, equations_of, fuse, span_of, with_unresolved_swing
 from flightmodel.checks import DivergenceError, FloatArray
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 from flightmodel.trajectory import nearest_index
@@ -347,13 +348,18 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[CameraTest]:
     The process's size is then the motion's own: taken as motion, an offset at a switch would make it large enough to
     explain the step.
     """
-    out, timed = [], _timed(evidence, fused)
+    out, free, timed = [], [], _timed(evidence, fused)
     for k, one in enumerate(timed):
-        anything = np.tile(_ANY_OFFSET_RAD * np.eye(2), (len(one.time_s), 1, 1))
-        free = [*timed[:k], replace(one, by_input=one.by_input | {_OFFSET: anything}), *timed[k + 1 :]]
-        post = _fitted(free, one.time_s).input_posterior
-        at = post.place[_OFFSET]
-        mean, covariance = post.mean[at], post.covariance[at, at]
+        anything = np.zeros((len(one.time_s), 2, 2 * len(timed)))
+        anything[:, :, 2 * k : 2 * k + 2] = _ANY_OFFSET_RAD * np.eye(2)
+        free.append(replace(one, by_input=one.by_input | {_OFFSET: anything}))
+    # all is linear, and what the tests have in common, all but the offset, is integrated over once
+    whole = equations_of(free, {}, span_of(free))
+    offsets = whole.without_inputs(whole.place[_OFFSET])
+    for k, one in enumerate(timed):
+        alone = offsets.with_inputs(slice(2 * k, 2 * k + 2))
+        mean, precision, _ = alone.of_inputs(alone.without_inputs().process_size(), "camera")
+        covariance = inverse(precision)
         if np.trace(covariance) < 2.0 - _LEAST_INFORMATION:  # else nothing connects it with the others
             square = float(mean @ np.linalg.solve(covariance, mean))
             out.append(CameraTest((one.method.removeprefix("camera "),), square, 2))

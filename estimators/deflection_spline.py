@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solveh_banded
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular, solveh_banded
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import coo_array, csr_array, dia_array, eye_array, kron
 
@@ -246,14 +246,33 @@ class NormalEquations:
             raise _undetermined(method) from None
         return mean, precision, cho_solve_banded((factor, False), self.right - self.across @ mean)
 
-    def without_inputs(self) -> NormalEquations:
-        """Equations of the deflection alone, the inputs being anything that their priors allow; no band any more."""
-        gain = cho_solve(cho_factor(self.inputs), self.across.T).T
-        whole = csr_array(np.triu(-gain @ self.across.T))
-        band, full = self.deflection, upper_band(whole)
-        width = max(len(band), len(full))
-        band, full = (np.vstack([np.zeros((width - len(one), one.shape[1])), one]) for one in (band, full))
-        return replace(self, deflection=band + full, right=self.right - gain @ self.right_inputs)
+    def without_inputs(self, kept: slice = slice(0)) -> NormalEquations:
+        """Equations of the deflection and the ``kept`` inputs, the others being anything that their priors allow.
+
+        The deflection's block is no band any more.
+        """
+        others = np.delete(np.arange(len(self.inputs)), kept)
+        # half of a solution: its product with itself is what the inputs take, for half the work
+        root = np.linalg.cholesky(self.inputs[np.ix_(others, others)])
+        blocks = self.across[:, others].T, self.inputs[others, kept], self.right_inputs[others]
+        across, inputs, right = (solve_triangular(root, block, lower=True) for block in blocks)
+        full, n = -across.T @ across, len(self.right)
+        band = np.zeros((n, n))
+        for above in range(n):
+            band[n - 1 - above, above:] = np.diagonal(full, above)
+        band[-len(self.deflection) :] += self.deflection
+        return replace(
+            self, place={}, deflection=band, across=self.across[:, kept] - across.T @ inputs,
+            inputs=self.inputs[kept, kept] - inputs.T @ inputs, right=self.right - across.T @ right,
+            right_inputs=self.right_inputs[kept] - inputs.T @ right,
+        )  # fmt: skip
+
+    def with_inputs(self, columns: slice) -> NormalEquations:
+        """Equations with some of the inputs alone, the others as stated."""
+        return replace(
+            self, place={}, across=self.across[:, columns], inputs=self.inputs[columns, columns],
+            right_inputs=self.right_inputs[columns],
+        )  # fmt: skip
 
     def process_size(self) -> float:
         """Most probable size of the process, rad/s^2, of the deflection's block alone."""

@@ -19,6 +19,11 @@ IntArray = NDArray[np.int64]
 Progress = Callable[[float, str], None]  # fraction done, and what is being done
 
 
+def part_of(report: Progress, number: int, parts: int) -> Progress:
+    """Report the progress of one of several parts as progress of the whole."""
+    return lambda fraction, what: report((number + fraction) / parts, what)
+
+
 class Fault(str):
     """One sentence of refusal with a short stable code (``"frame-missing"``), which scripts and tests may use.
 

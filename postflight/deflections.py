@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type
+from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
@@ -297,7 +297,7 @@ def estimate(
             if method == "camera":
                 from postflight.filming import camera_answer
 
-                filmed = seen() or camera_answer(flight, bet, _part(report, k, len(methods)))
+                filmed = seen() or camera_answer(flight, bet, part_of(report, k, len(methods)))
                 history = filmed.history
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
@@ -383,11 +383,6 @@ def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
         if bias is None or not bias.is_off:
             raise
         raise GateError(f"{bias.cause}; {fault}", fault.codes[0]) from None
-
-
-def _part(report: Progress, number: int, parts: int) -> Progress:
-    """Report the progress of one of several parts as progress of the whole."""
-    return lambda fraction, what: report((number + fraction) / parts, what)
 
 
 def _time_bias_sd_s(flight: Flight) -> float:

@@ -7,7 +7,6 @@ estimated from all films, and every frame's answer uses it.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -24,7 +23,7 @@ from estimators.frame_edits import edited
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
 from estimators.unloaded_frames import Rest, rest_of
-from flightmodel.checks import DivergenceError, Fault, GateError, Progress
+from flightmodel.checks import DivergenceError, Fault, GateError, Progress, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
@@ -212,19 +211,16 @@ def camera_answer(
 
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
-    names = list(flight.telemetry.films)
-
-    def film_or_fault(name: str) -> FilmFit | Fault:
-        shown = progress if name == names[0] else None  # the others are read meanwhile
+    films: dict[str, FilmFit] = {}
+    refused: dict[str, Fault] = {}
+    of_flight = flight.telemetry.films
+    # one after the other: in threads they take as long, for each holds the interpreter most of the time
+    for k, (name, frames) in enumerate(of_flight.items()):
+        shown = None if progress is None else part_of(progress, k, len(of_flight))
         try:
-            return camera_film(flight, flight.telemetry.films[name], shown)
+            films[name] = camera_film(flight, frames, shown)
         except GateError as fault:
-            return Fault(str(fault), fault.codes[0])
-
-    with ThreadPoolExecutor(len(names)) as pool:
-        of_each = dict(zip(names, pool.map(film_or_fault, names), strict=True))
-    films = {name: film for name, film in of_each.items() if isinstance(film, FilmFit)}
-    refused = {name: fault for name, fault in of_each.items() if isinstance(fault, Fault)}
+            refused[name] = Fault(str(fault), fault.codes[0])
     if not films:
         raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
     films, shape, words_of_shape = _with_shell_shape(films, flight, bet)

@@ -6,7 +6,16 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cholesky_banded, lstsq
 from scipy.sparse import csr_array
 
-from estimators.deflection_spline import KNOT_S, Spline, block_diagonal, inverse_in_band, upper_band
+from estimators.deflection_spline import (
+    KNOT_S,
+    NormalEquations,
+    Rows,
+    Spline,
+    block_diagonal,
+    inverse,
+    inverse_in_band,
+    upper_band,
+)
 
 
 def unbanded(band):
@@ -65,3 +74,35 @@ def test_blocks_stand_on_the_diagonal():
     for k in range(3):
         np.testing.assert_array_equal(got[2 * k : 2 * k + 2, 2 * k : 2 * k + 2], blocks[k])
     assert np.count_nonzero(got) == 12
+
+
+def equations(columns):
+    """Of 60 readings at random with the responses to nine inputs, of which those of some columns are asked for."""
+    rng, spline = np.random.default_rng(6), Spline.over(0.0, 1.5)
+    time_s, by_input, want = rng.uniform(0.0, 1.5, 60), rng.normal(size=(120, 9)), rng.normal(size=120)
+    lateral = np.broadcast_to(30.0 * np.eye(2), (60, 2, 2))
+    rows = Rows(spline.responses(time_s, (lateral,)), by_input[:, columns], want)
+    return NormalEquations.of_rows(spline, {"all": slice(0, by_input[:, columns].shape[1])}, [rows])
+
+
+def test_inputs_integrated_over_leave_the_posterior_of_the_rest():
+    whole, kept, size = equations(slice(None)), slice(3, 5), 2.0
+    answer, others = whole.solved(size, ""), equations(np.r_[0:3, 5:9])
+    part = whole.without_inputs(kept)
+    mean, precision, _ = part.of_inputs(size, "")
+    first = 2 * whole.spline.count
+    np.testing.assert_allclose(mean, answer.mean[first:][kept], rtol=1e-9)
+    np.testing.assert_allclose(inverse(precision), answer.inputs[kept, kept], rtol=1e-9)
+    np.testing.assert_allclose(whole.without_inputs().mean(size, ""), answer.mean[:first], atol=1e-12)
+    # the kept ones taken as stated
+    stated = part.with_inputs(slice(0, 0)).mean(size, "")
+    np.testing.assert_allclose(stated, others.solved(size, "").mean[:first], atol=1e-12)
+    assert np.abs(stated - answer.mean[:first]).max() > 1e-4
+
+
+def test_one_input_of_several_is_found_as_if_it_were_the_only_one():
+    mean, precision, found = equations(slice(None)).with_inputs(slice(4, 6)).of_inputs(2.0, "")
+    alone = equations(slice(4, 6)).of_inputs(2.0, "")
+    np.testing.assert_allclose(mean, alone[0], rtol=1e-12)
+    np.testing.assert_allclose(precision, alone[1], rtol=1e-12)
+    np.testing.assert_allclose(found(np.array([0.7])), alone[2](np.array([0.7])), rtol=1e-12)
