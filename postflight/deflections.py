@@ -295,9 +295,10 @@ def estimate(
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
-                from postflight.filming import camera_answer
+                from postflight.filming import camera_answer, keep_oriented
 
                 filmed = seen() or camera_answer(flight, bet, part_of(report, k, len(methods)))
+                keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None:
                 raise GateError(f"{method}: needs a trajectory", "trajectory-missing")

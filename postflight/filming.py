@@ -8,7 +8,6 @@ estimated from all films, and every frame's answer uses it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 import pandas as pd
@@ -35,6 +34,9 @@ from postflight.reconstruction import Reconstruction
 from recon.consistency import ConsistencyCheck
 
 _SAME_FRAME_S = 1e-3
+# cameras that were oriented last, of which a run's pictures ask several times; as many as flights have
+_ORIENTED: dict[tuple[Frames, Vehicle], OrientedCamera] = {}
+_MOST_ORIENTED = 4
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ class CameraAnswer:
     unfounded : dict of Fault
         Of each camera, where the vehicle file states features: why its benchmark frame does not show them; empty where
         it does.
+    oriented : dict of OrientedCamera
+        Each camera with an answer, oriented on its benchmark frame.
     """
 
     history: DeflectionHistory
@@ -79,6 +83,7 @@ class CameraAnswer:
     rests: dict[str, Rest] = field(default_factory=dict)
     plane: PlaneTest | None = None
     unfounded: dict[str, Fault] = field(default_factory=dict)
+    oriented: dict[str, OrientedCamera] = field(default_factory=dict)
 
     @property
     def has_only_benchmarks(self) -> bool:
@@ -146,7 +151,6 @@ def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress
     )
 
 
-@lru_cache(maxsize=4)  # a run's pictures ask for it four times
 def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
     """Camera oriented on the benchmark frame of a film, with what an analyst decided about it.
 
@@ -155,9 +159,26 @@ def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
     GateError
         Where the frame cannot be used.
     """
-    at_s = float(frames.time_s[frames.benchmark])
-    picture = edited(frames.picture(frames.benchmark), frames.edits, at_s, frames.burnt_in)
-    return orient_camera(picture, vehicle.geometry, frames.camera, vehicle.joint.station_m, pose=frames.edits.pose)
+    found = _ORIENTED.get((frames, vehicle))
+    if found is None:
+        at_s = float(frames.time_s[frames.benchmark])
+        picture = edited(frames.picture(frames.benchmark), frames.edits, at_s, frames.burnt_in)
+        station_m, pose = vehicle.joint.station_m, frames.edits.pose
+        found = orient_camera(picture, vehicle.geometry, frames.camera, station_m, pose=pose)
+        _keep(frames, vehicle, found)
+    return found
+
+
+def keep_oriented(telemetry: Telemetry, oriented: dict[str, OrientedCamera]) -> None:
+    """Let `orient_on_film` have cameras that an answer, perhaps of another process, was made with."""
+    for name, one in oriented.items():
+        _keep(telemetry.films[name], telemetry.required_vehicle(), one)
+
+
+def _keep(frames: Frames, vehicle: Vehicle, oriented: OrientedCamera) -> None:
+    _ORIENTED[frames, vehicle] = oriented
+    for old in list(_ORIENTED)[:-_MOST_ORIENTED]:
+        _ORIENTED.pop(old, None)
 
 
 def joint_swing(vehicle: Vehicle) -> JointSwing | None:
@@ -202,7 +223,7 @@ def camera_answer(
         smooth = _smooth(flight, history)
         return CameraAnswer(
             history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests, plane_test(film),
-            _unfounded(shaped, flight),
+            _unfounded(shaped, flight), {name: film.oriented},
         )  # fmt: skip
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
@@ -252,7 +273,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
     return CameraAnswer(
         history, at_plain.at_frames, smooth, frames, joined, refused, times, shape, rests,
-        unfounded=_unfounded(films, flight),
+        unfounded=_unfounded(films, flight), oriented={name: film.oriented for name, film in films.items()},
     )  # fmt: skip
 
 

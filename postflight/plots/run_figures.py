@@ -15,7 +15,7 @@ from estimators.trim import static_trim
 from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from postflight.deflections import Deflections
-from postflight.filming import by_camera
+from postflight.filming import by_camera, keep_oriented
 from postflight.flight import Flight
 from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.deflection import figure_correlation, figure_fusion, figure_increments, figure_summary
@@ -80,6 +80,8 @@ def draw_deflections(flight: Reconstruction, folder: Path, answers: Deflections)
     if "misalignment" in answers.histories:
         draw(folder / "figure_2_7.png", figure_2_7, flight, answers.histories["misalignment"])
     if "camera" in answers.histories:
+        if answers.camera is not None:  # in a second process nothing is oriented yet
+            keep_oriented(flight.telemetry, answers.camera.oriented)
         draw_camera(flight.flight, answers.histories["camera"], folder)
     if answers.fused is not None:
         answer = answers.fused

@@ -1,6 +1,8 @@
 """A film instead of images: the same frames by number, and every way in which list and film can disagree."""
 
+import pickle
 import re
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -8,8 +10,11 @@ import pytest
 
 from flightmodel.film import film_frames
 from flightmodel.flightfolder import read_flight
-from postflight.filming import camera_answer
+from postflight import filming
+from postflight.deflections import estimate
+from postflight.filming import camera_answer, orient_on_film
 from postflight.flight import read_flight as read_flown
+from postflight.plots import run_figures
 from synthetic_flight.film import Imaging
 from tests.estimators.test_camera_deflection import film as rendered
 from tests.postflight.test_bad_input import names_line, refused
@@ -181,6 +186,47 @@ def test_a_film_that_contradicts_what_is_stated_turns_a_check_red(flight, painte
     assert {"camera-features"} | ({"camera-plane"} if plane_deg else set()) <= set(checks)
     assert {code for code, check in checks.items() if not check.passed} == red
     assert {check.source for check in checks.values() if not check.passed} <= {"camera"}
+
+
+@pytest.fixture
+def deflected(flight):
+    """The clean folder with three frames that show a deflection."""
+    for k, picture in enumerate(rendered(4, [0.0, 3.0, 3.0], [0.0, 170.0, 180.0])):
+        cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), picture)
+    return flight
+
+
+def test_a_run_s_pictures_take_the_camera_as_the_answer_oriented_it(deflected, monkeypatch):
+    """Here, and where the answer comes from another process or goes to one, whose telemetry is a copy."""
+    flown, copy, fresh = (read_flown(deflected.root, needs_path=False) for _ in range(3))
+    vehicle = fresh.telemetry.required_vehicle()
+    want = orient_on_film(fresh.telemetry.frames, vehicle).view.camera
+    monkeypatch.setattr(filming, "orient_camera", None)  # from here on only answers orient a camera
+    with pytest.raises(TypeError):
+        orient_on_film(flown.telemetry.frames, flown.telemetry.required_vehicle())
+    answers = estimate(flown, ("camera",))
+    drawn = []
+
+    def draw_camera(seen, _history, _folder):
+        drawn.append(orient_on_film(seen.telemetry.frames, seen.telemetry.required_vehicle()).view.camera)
+
+    monkeypatch.setattr(run_figures, "draw_camera", draw_camera)
+    monkeypatch.setattr(run_figures, "draw", lambda *_: None)
+    draw_camera(flown, None, None)
+    bet = SimpleNamespace(flight=copy, telemetry=copy.telemetry)
+    run_figures.draw_deflections(bet, deflected.root, pickle.loads(pickle.dumps(answers)))
+    assert len(drawn) == 2
+    for got in drawn:
+        for part, own in zip(got.lens_terms, want.lens_terms, strict=True):
+            np.testing.assert_array_equal(part, own)
+
+
+def test_no_more_cameras_are_kept_oriented_than_a_flight_has(deflected):
+    flights = [read_flown(deflected.root, needs_path=False).telemetry for _ in range(6)]
+    oriented = {"camera5": orient_on_film(flights[0].frames, flights[0].required_vehicle())}
+    for telemetry in flights:
+        filming.keep_oriented(telemetry, oriented)
+    assert [frames for frames, _ in filming._ORIENTED] == [telemetry.frames for telemetry in flights[2:]]
 
 
 def test_a_benchmark_frame_alone_is_no_answer(flight, command):
