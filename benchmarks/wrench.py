@@ -107,7 +107,7 @@ def compiled_wrench(c: Constants):
 
 def numpy_wrench(c: Constants):
     """Return the same in numpy: arrays where they help, floats where numpy would be slow on three numbers."""
-    gm, j2, a, flat, rate = earth.WGS84
+    gm, j2, a, flat, rate = earth.WGS84[:5]
     e2 = flat * (2.0 - flat)
     mass_a, mass_b, area, length = (float(x) for x in c.numbers[:4])
     cg_a, joint, cg_b = c.numbers[4:7], c.numbers[7:10], c.numbers[10:13]
