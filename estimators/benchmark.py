@@ -69,7 +69,7 @@ from estimators.frame_edits import MARK_SD_PX, EditedFrame, MarkedFeatures, mark
 from estimators.frame_residuals import FrameResiduals, edge_residuals, feature_residuals, huber_gain, joined
 from estimators.frame_solution import POSED, AprioriSd
 from estimators.loads import FlightLoads
-from estimators.texture import texture_of
+from estimators.texture import BESIDE_PAINT_PX, PaintedTexture, texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
 from flightmodel import rotations
 from flightmodel.camera import Camera, camera_from_mount
@@ -179,7 +179,7 @@ def orient_camera(
     if geometry.features not in ("none", "texture"):
         oriented, refused = _by_stated_features(nominal, frame, prior, apriori)
         if oriented is not None:
-            return _with_marked(oriented, frame)
+            return _with_marked(_with_texture_behind(oriented, frame), frame)
     try:
         oriented = _oriented(nominal, frame, prior, apriori, valleys)
     except GateError as refused_as_mounted:
@@ -219,6 +219,14 @@ def _by_stated_features(
         f"with an rms of {oriented.residual_rms_px:.1f} px"
     )
     return None, Fault(words, "features-not-found")
+
+
+def _with_texture_behind(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCamera:
+    """Add the benchmark frame's texture behind the painted features that oriented the camera."""
+    painted = oriented.features
+    assert isinstance(painted, ImageFeatures)
+    both = PaintedTexture(painted, texture_of(oriented.view, benchmark.image, BESIDE_PAINT_PX))
+    return _with_features(oriented, both, benchmark, TEXTURE_SD_PX, len(painted.across_px))
 
 
 def _with_texture(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCamera:

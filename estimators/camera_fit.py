@@ -53,6 +53,7 @@ from estimators.frame_solution import (
     least_points,
     refused_fit,
 )
+from estimators.texture import PaintedTexture
 from estimators.virtual_camera import DEFLECTION, RADIUS
 from flightmodel.checks import Fault, FloatArray
 from flightmodel.statistics import NORMAL_MAD
@@ -66,6 +67,7 @@ _FEW_FEATURES = 0.6  # of those found at the benchmark
 _FAR_RAD = np.deg2rad([4.0, 4.0])  # about the last answer, which is at most a swing away: IRVE-II's whole deflection
 # texture
 TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
+_NEAR_PAINT_PX = 2  # painted features to a third of one
 _WORST_TEXTURE_SD_PX = 0.5  # as wide as what agrees: a less sharp patch cannot say whether it does
 TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
 # by chance a sixth of the patches lie within half a pixel of six; of light and shade on plain cloth, which seem to move
@@ -144,9 +146,9 @@ class OrientedCamera(FrameModel):
         with_open_plane: FrameFit | None = None
         mount_px, mount_is_sure = self._mount_px(frame)
         try:
-            painted = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
-            if isinstance(painted, ImageFeatures) and len(painted.points_shell_m):
-                place = self._approach(frame, deformation, painted)
+            if self.painted is not None:
+                place = self._approach(frame, deformation, self.painted)
+                place = self._texture_near(frame, deformation) or place
                 horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
             else:
                 seen = self._approach_by_texture(frame, deformation)
@@ -208,8 +210,7 @@ class OrientedCamera(FrameModel):
         try:
             return both, self._check_explained(both)
         except NoFitError as fault:
-            most = max(USUAL_SHARE * self._benchmark_counts[1], LEAST_FEATURES)
-            if fault.codes != ("edge-not-shell",) or place is None or not len(found_rows(place)) > most:
+            if fault.codes != ("edge-not-shell",) or place is None or not self._shows_most(found_rows(place)):
                 raise
         alone = self._solve(_NOTHING, place, deformation, np.eye(2), USUAL_RMS_PX)
         return alone, self._check_explained(alone)
@@ -227,9 +228,17 @@ class OrientedCamera(FrameModel):
             raise NoFitError(fault)
         return variance
 
+    def _shows_most(self, rows: NDArray[np.intp]) -> bool:
+        """Whether the rows (n,) of features found are enough, and most of what the benchmark frame shows of theirs."""
+        return len(rows) > max(USUAL_SHARE * self._alike_at_benchmark(rows), LEAST_FEATURES)
+
+    def _alike_at_benchmark(self, rows: NDArray[np.intp]) -> int:
+        """Features of the benchmark frame of the kind of rows (n,)."""
+        return self.features_at_benchmark(bool(len(rows)) and bool(rows[0] < self.painted_rows))
+
     def _check_seen(self, horizon: HorizonLine, last: Solution) -> None:
         """Refuse a frame of which little is seen: what there is may agree by chance."""
-        of_features = (len(last.rows) - last.edge_count) / max(self._benchmark_counts[1], 1)
+        of_features = len(last.feature_rows) / max(self._alike_at_benchmark(last.feature_rows), 1)
         of_edge = self._edge_share(len(horizon.points_px))
         wanted = _EDGE_BESIDE if of_features < _HARDLY_FEATURES else _LITTLE_SEEN
         if max(of_edge, of_features) < wanted:
@@ -341,6 +350,21 @@ class OrientedCamera(FrameModel):
         deformation[:] = alone
         return self._solve(near, None, deformation, np.eye(2), np.inf)
 
+    def _texture_near(self, frame: EditedFrame, deformation: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Places of the texture behind painted features, near their answer; None where there is none or little agrees.
+
+        What agrees in a part of the picture alone may be another time's.
+        """
+        features = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
+        if not isinstance(features, PaintedTexture):
+            return None
+        place, sd = np.zeros(len(self.features.across_px)), np.full(len(self.features.across_px), np.inf)
+        rows = slice(self.painted_rows, self.painted_rows + len(features.texture.across_px))
+        place[rows], sd[rows] = frame.features(features.texture, self.view, deformation, _NEAR_PAINT_PX)
+        agreed, _, _ = self._agreeing((place, sd), deformation)
+        enough = _LITTLE_SEEN * self.features_at_benchmark(painted=False)
+        return None if agreed is None or len(found_rows(agreed)) < enough else agreed
+
     def _approach_by_texture(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
         """Move ``deformation`` in place to where the texture agrees with itself, else to where the edge is.
 
@@ -449,7 +473,7 @@ class OrientedCamera(FrameModel):
         From where the search starts, if most features are found there; else from where the edge is found or where the
         feature map fits, whichever shows most: behind the rim may be the Earth, whose limb is an edge too.
         """
-        wanted = _FEW_FEATURES * self._benchmark_counts[1]
+        wanted = _FEW_FEATURES * self.features_at_benchmark(painted=True)
         guesses = [deformation.copy()]
         found = [frame.features(self.features, self.view, deformation, REACH_PX)]
         trouble = NO_FAULT

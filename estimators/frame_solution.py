@@ -39,11 +39,12 @@ from numpy.typing import NDArray
 from estimators import _fit_kernels
 from estimators.body_edge import BodyEdge
 from estimators.edge import NO_FAULT, HorizonLine, ScanLines
-from estimators.features import Features, light_shift
+from estimators.features import Features, ImageFeatures, light_shift
 from estimators.frame_checks import WORST_SHAPE
-from estimators.frame_edits import LEAST_MARKS
+from estimators.frame_edits import LEAST_MARKS, MarkedFeatures
 from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
 from estimators.surface_noise import NoisePlaces, SurfaceNoise, noise_places
+from estimators.texture import PaintedTexture
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
 from flightmodel.deflection import lv_clock
@@ -305,15 +306,31 @@ class FrameModel:
         return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
 
     @cached_property
-    def _benchmark_counts(self) -> tuple[int, int]:
-        """Edge points and features found in the benchmark frame."""
-        edge = int(self._benchmark_edge.sum())
-        return edge, len(self._benchmark_edge) - edge
+    def _edge_at_benchmark(self) -> int:
+        """Edge points found in the benchmark frame."""
+        return int(self._benchmark_edge.sum())
+
+    def features_at_benchmark(self, painted: bool) -> int:
+        """Painted features found in the benchmark frame, or all other ones."""
+        rows = self.benchmark_residuals.index[~self._benchmark_edge] - len(self.clocks_rad)
+        return int(((rows < self.painted_rows) == painted).sum())
+
+    @property
+    def painted_rows(self) -> int:
+        """How many rows of the features, the first, are painted ones."""
+        return 0 if self.painted is None else len(self.painted.across_px)
+
+    @cached_property
+    def painted(self) -> ImageFeatures | None:
+        """Features of known places on the shell; None where there is texture, or nothing."""
+        found = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
+        found = found.painted if isinstance(found, PaintedTexture) else found
+        return found if isinstance(found, ImageFeatures) and len(found.points_shell_m) else None
 
     @property
     def edge_in_view(self) -> float:
         """Share of the edge looked for that the benchmark frame shows."""
-        return self._benchmark_counts[0] / max(len(self.clocks_rad), 1)
+        return self._edge_at_benchmark / max(len(self.clocks_rad), 1)
 
     @cached_property
     def noise_places(self) -> NoisePlaces | None:
@@ -325,7 +342,7 @@ class FrameModel:
 
     def _edge_share(self, points: int) -> float:
         """So many edge points over those of the benchmark frame; none where that shows no edge."""
-        there = self._benchmark_counts[0]
+        there = self._edge_at_benchmark
         return points / there if there else 0.0
 
     def _at_benchmark(

@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators import _texture_kernels
+from estimators.features import ImageFeatures
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import circumferential, torus_circles
@@ -48,6 +49,8 @@ Picture = NDArray[np.float32]
 HALF_PX = 7  # of a patch: at most a third of a torus as a camera on the centerbody sees it
 _FINE_PX, _COARSE_PX = 0.8, 2.0  # of the band-pass: the lens's blur, and less than the patch
 _CELL_PX = 12  # one patch at the most in a square of this size, so that they spread over the shell
+# the same beside painted features: a sixth of the patches measures within a hundredth of a degree of all
+BESIDE_PAINT_PX = 32
 _STEP_M = 0.002  # along the touching plane, for the affine map
 _LEAST_CORRELATION = 0.8  # assumed; whether patches agree is tested afterwards
 _QUIET, _ABOVE_NOISE, _LEAST_GREY = 0.1, 3.0, 0.3  # quantile of plain cloth; a mark over its noise; rounding
@@ -187,7 +190,46 @@ class TrackedTexture:
         return middle, per_m @ self.to_tangents
 
 
-def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
+@dataclass(frozen=True)
+class PaintedTexture:
+    """Painted features, which are found from far, and behind them the texture, which measures where it agrees.
+
+    A mark's place on the shell is known to millimetres, and its shades are its own; a patch is compared with itself.
+
+    Parameters
+    ----------
+    painted : ImageFeatures
+    texture : TrackedTexture
+    """
+
+    painted: ImageFeatures
+    texture: TrackedTexture
+
+    @property
+    def points_shell_m(self) -> FloatArray:
+        """See `Features`."""
+        return np.concatenate([self.painted.points_shell_m, self.texture.points_shell_m])
+
+    @property
+    def across_px(self) -> FloatArray:
+        """See `Features`."""
+        return np.concatenate([self.painted.across_px, self.texture.across_px])
+
+    @property
+    def alike(self) -> FloatArray:
+        """See `Features`."""
+        return np.concatenate([self.painted.alike, self.texture.alike])
+
+    def find(
+        self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """See `Features.find`; the painted ones alone, the texture is looked for near their answer."""
+        place, sd = self.painted.find(view, image, deformation, reach_px)
+        more = len(self.texture.across_px)
+        return np.append(place, np.zeros(more)), np.append(sd, np.full(more, np.inf))
+
+
+def texture_of(view: VirtualCamera, benchmark: Image, cell_px: int = _CELL_PX) -> TrackedTexture:
     """Patches of the shell in a benchmark frame that show something, spread over what is in view.
 
     Parameters
@@ -195,9 +237,11 @@ def texture_of(view: VirtualCamera, benchmark: Image) -> TrackedTexture:
     view : VirtualCamera
         As oriented on this frame.
     benchmark : (h, w) uint8
+    cell_px : int
+        Side of the squares of which each has one patch at the most.
     """
     picture = band_passed(benchmark)
-    pixels = _spread_corners(benchmark, picture, _on_one_torus(view, benchmark.shape))
+    pixels = _spread_corners(benchmark, picture, _on_one_torus(view, benchmark.shape), cell_px)
     seen = surface_seen(view, pixels.astype(float))
     good = (seen.torus >= 0) & (seen.normals[:, 0] < 0.0)
     pixels, points, normals = pixels[good], seen.points_shell_m[good], seen.normals[good]
@@ -253,7 +297,7 @@ def _spread(picture: FloatArray, kernel: NDArray[np.uint8]) -> FloatArray:
     return np.asarray(cv2.dilate(grey, kernel) - cv2.erode(grey, kernel), dtype=float)
 
 
-def _spread_corners(image: Image, picture: Picture, mask: BoolArray) -> NDArray[np.int64]:
+def _spread_corners(image: Image, picture: Picture, mask: BoolArray, cell_px: int) -> NDArray[np.int64]:
     """Pixels (n, 2) of the strongest corner in every cell of a grid, where there is one to be seen."""
     if not mask.any():
         return np.zeros((0, 2), dtype=np.int64)
@@ -264,9 +308,9 @@ def _spread_corners(image: Image, picture: Picture, mask: BoolArray) -> NDArray[
     noise = max(min(quietest, _BAND * noise_of(image)), _LEAST_GREY)
     strength = np.where(mask & (level > _ABOVE_NOISE * noise), cv2.cornerMinEigenVal(picture, size, 3), -1.0)
     chosen = []
-    for top in range(0, mask.shape[0], _CELL_PX):
-        for left in range(0, mask.shape[1], _CELL_PX):
-            cell = strength[top : top + _CELL_PX, left : left + _CELL_PX]
+    for top in range(0, mask.shape[0], cell_px):
+        for left in range(0, mask.shape[1], cell_px):
+            cell = strength[top : top + cell_px, left : left + cell_px]
             v, u = np.unravel_index(int(np.argmax(cell)), cell.shape)
             if cell[v, u] > 0.0:
                 chosen.append((left + u, top + v))

@@ -317,7 +317,7 @@ def test_a_frame_that_shows_too_little_of_edge_and_features_is_refused(seen_px, 
 def test_without_an_edge_in_the_benchmark_frame_no_edge_is_a_share_of_it(monkeypatch):
     oriented = orient_camera(film(4, [0.0], [0.0])[0], GEOMETRY, MOUNT, JOINT_M)
     assert oriented._edge_share(120) == pytest.approx(0.5, abs=0.05)
-    monkeypatch.setitem(oriented.__dict__, "_benchmark_counts", (0, 3))
+    monkeypatch.setitem(oriented.__dict__, "_edge_at_benchmark", 0)
     assert oriented._edge_share(120) == 0.0
 
 

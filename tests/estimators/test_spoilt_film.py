@@ -255,20 +255,20 @@ def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
 def test_part_of_an_edge_beside_hardly_a_feature_is_no_answer(frames):
     """It passes for that of a shell degrees away, and features there for a few of its own."""
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
-    edge, features = int(oriented._benchmark_edge.sum()), int((~oriented._benchmark_edge).sum())
+    edge, first = oriented._edge_at_benchmark, {True: 0, False: oriented.painted_rows}
 
-    def seen(of_edge, of_features):
-        points = int(of_edge * edge)
-        rows = np.zeros(points + int(of_features * features))
-        last = SimpleNamespace(rows=rows, edge_count=points)
+    def seen(of_edge, of_features, painted):
+        points, count = int(of_edge * edge), int(of_features * oriented.features_at_benchmark(painted))
+        last = SimpleNamespace(feature_rows=first[painted] + np.arange(count))
         oriented._check_seen(SimpleNamespace(points_px=np.zeros(points)), last)
 
-    seen(0.6, 0.3)
-    seen(0.9, 0.1)
-    for of_edge, of_features in ((0.6, 0.1), (0.3, 0.3)):
-        with pytest.raises(GateError) as refusal:
-            seen(of_edge, of_features)
-        assert refusal.value.codes == ("shell-little-seen",)
+    for painted in (True, False):
+        seen(0.6, 0.3, painted)
+        seen(0.9, 0.1, painted)
+        for of_edge, of_features in ((0.6, 0.1), (0.3, 0.3)):
+            with pytest.raises(GateError) as refusal:
+                seen(of_edge, of_features, painted)
+            assert refusal.value.codes == ("shell-little-seen",)
 
 
 @pytest.mark.parametrize(("key", "off_deg"), [("roll_deg", 80.0), ("axis_from_forward_deg", -20.0)])

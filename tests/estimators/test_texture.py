@@ -4,12 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from estimators.texture import surface_seen, texture_of
+from estimators.benchmark import orient_camera
+from estimators.frame_edits import EditedFrame
+from estimators.frame_solution import found_rows
+from estimators.texture import PaintedTexture, surface_seen, texture_of
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.geometry import vehicle_meshes
 from flightmodel.rendering import render
-from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
+from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
 VIEW = VirtualCamera(GEOMETRY, camera_from_mount(MOUNT), JOINT_M)
 
@@ -87,3 +90,38 @@ def test_noise_alone_is_no_texture():
     _, sd = texture.find(VIEW, cloth(np.random.default_rng(4)), np.zeros(3), 3)
     assert np.isfinite(sd).mean() < 0.01
     assert len(texture_of(VIEW, np.full((480, 720), 90, dtype=np.uint8)).templates) == 0
+
+
+def test_behind_painted_features_the_texture_measures_where_most_of_it_agrees():
+    frames = film(7, [0.0, 3.0, 4.0], [0.0, 160.0, 150.0])
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    features, painted = oriented.features, oriented.painted_rows
+    assert isinstance(features, PaintedTexture)
+    at = np.array([*oriented.fit(frames[2]).rotation_yz_rad, 0.0])
+    _, sd = features.find(oriented.view, frames[2], at, 8)
+    assert len(found_rows((sd, sd))) > 0.7 * painted
+    assert np.isinf(sd[painted:]).all()
+    place = oriented._texture_near(EditedFrame(frames[2]), at)
+    assert found_rows(place)[0] >= painted
+    assert oriented.fit(frames[2]).features < len(found_rows(place)) + 1
+    # of a part of the picture that is another time's the texture agrees with itself, and measures nothing
+    held = frames[1].copy()
+    held[:, :250] = frames[2][:, :250]
+    assert oriented._texture_near(EditedFrame(held), at) is None
+
+
+def test_a_mark_that_is_found_elsewhere_than_its_cloth_does_not_move_the_answer():
+    """Light from one side shifts where painted marks are darkest; here by half a pixel, all of them."""
+    frames = film(7, [0.0, 3.0], [0.0, 160.0])
+    oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    shifted = oriented.features.painted.find
+
+    class Shifted(type(oriented.features.painted)):
+        def find(self, view, image, deformation, reach_px):
+            place, sd = shifted(view, image, deformation, reach_px)
+            return place + 0.5 * self.across_px[:, 1], sd
+
+    moved = Shifted(**vars(oriented.features.painted))
+    object.__setattr__(oriented.features, "painted", moved)
+    answer = oriented.fit(frames[1])
+    np.testing.assert_allclose(answer.rotation_yz_rad, deformation_of(D(3.0), D(160.0))[:2], atol=D(0.05))
