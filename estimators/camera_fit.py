@@ -67,7 +67,9 @@ _FEW_FEATURES = 0.6  # of those found at the benchmark
 _FAR_RAD = np.deg2rad([4.0, 4.0])  # about the last answer, which is at most a swing away: IRVE-II's whole deflection
 # texture
 TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
-_NEAR_PAINT_PX = 2  # painted features to a third of one
+# painted features to a third of one. This share of those found lies within three times that of the texture's answer: in
+# sound frames of another renderer 0.86 at the least, where half of the picture is another time's 0.65 to 0.81
+_NEAR_PAINT_PX, _PAINTED_PX, _LEAST_PAINTED = 2, 1.0, 0.85
 _WORST_TEXTURE_SD_PX = 0.5  # as wide as what agrees: a less sharp patch cannot say whether it does
 TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
 # by chance a sixth of the patches lie within half a pixel of six; of light and shade on plain cloth, which seem to move
@@ -148,7 +150,7 @@ class OrientedCamera(FrameModel):
         try:
             if self.painted is not None:
                 place = self._approach(frame, deformation, self.painted)
-                place = self._texture_near(frame, deformation) or place
+                place = self._texture_near(frame, deformation, place) or place
                 horizon = frame.near_edge(self.view.lines_at(self.clocks_rad, deformation))
             else:
                 seen = self._approach_by_texture(frame, deformation)
@@ -350,20 +352,31 @@ class OrientedCamera(FrameModel):
         deformation[:] = alone
         return self._solve(near, None, deformation, np.eye(2), np.inf)
 
-    def _texture_near(self, frame: EditedFrame, deformation: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Places of the texture behind painted features, near their answer; None where there is none or little agrees.
+    def _texture_near(
+        self, frame: EditedFrame, deformation: FloatArray, painted: tuple[FloatArray, FloatArray] | None
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Places of the texture behind ``painted`` features, near their answer; None where it cannot take their place.
 
-        What agrees in a part of the picture alone may be another time's.
+        Hardly any of it may agree, or only what lies in a part of the picture, which then is another time's: the
+        painted features must be where the texture puts the shell.
         """
         features = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
-        if not isinstance(features, PaintedTexture):
+        if not isinstance(features, PaintedTexture) or painted is None:
             return None
         place, sd = np.zeros(len(self.features.across_px)), np.full(len(self.features.across_px), np.inf)
         rows = slice(self.painted_rows, self.painted_rows + len(features.texture.across_px))
         place[rows], sd[rows] = frame.features(features.texture, self.view, deformation, _NEAR_PAINT_PX)
         agreed, _, _ = self._agreeing((place, sd), deformation)
-        enough = _LITTLE_SEEN * self.features_at_benchmark(painted=False)
-        return None if agreed is None or len(found_rows(agreed)) < enough else agreed
+        if agreed is None or len(found_rows(agreed)) < _HARDLY_FEATURES * self.features_at_benchmark(painted=False):
+            return None
+        moved = deformation.copy()
+        self._fit_points(_NOTHING, agreed, moved, np.eye(2))
+        has = found_rows(painted)
+        there = np.einsum("ni,ni->n", self.view.sight(self.features.points_shell_m[has], moved).pixels,
+                          self.features.across_px[has])  # fmt: skip
+        off = painted[0][has] - there - self._at_benchmark(len(self.clocks_rad) + has)[0]
+        known = np.isfinite(off)  # also found in the benchmark frame
+        return agreed if np.mean(np.abs(off[known]) < _PAINTED_PX) > _LEAST_PAINTED else None
 
     def _approach_by_texture(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
         """Move ``deformation`` in place to where the texture agrees with itself, else to where the edge is.
