@@ -375,8 +375,8 @@ class OrientedCamera(FrameModel):
         there = np.einsum("ni,ni->n", self.view.sight(self.features.points_shell_m[has], moved).pixels,
                           self.features.across_px[has])  # fmt: skip
         off = painted[0][has] - there - self._at_benchmark(len(self.clocks_rad) + has)[0]
-        known = np.isfinite(off)  # also found in the benchmark frame
-        return agreed if np.mean(np.abs(off[known]) < _PAINTED_PX) > _LEAST_PAINTED else None
+        known = np.isfinite(off).sum()  # also found in the benchmark frame
+        return agreed if (np.abs(off) < _PAINTED_PX).sum() > _LEAST_PAINTED * known else None
 
     def _approach_by_texture(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
         """Move ``deformation`` in place to where the texture agrees with itself, else to where the edge is.
