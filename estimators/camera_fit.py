@@ -35,7 +35,7 @@ from estimators.edge import (
 )
 from estimators.features import ImageFeatures, fit_feature_map, valleys
 from estimators.frame_checks import USUAL_RMS_PX, Design, fault_of_fit
-from estimators.frame_edits import EditedFrame, MarkedFeatures, unedited
+from estimators.frame_edits import EditedFrame, unedited
 from estimators.frame_residuals import edge_residuals
 from estimators.frame_solution import (
     BESIDE,
@@ -286,7 +286,7 @@ class OrientedCamera(FrameModel):
             Place found, unit vector along which it is measured, residual against the tried deformation beyond the
             benchmark frame's, px; whether a fit at the first one uses it.
         """
-        frame, lines = unedited(picture), len(self.clocks_rad)
+        frame = unedited(picture)
         found = frame.near_edge(self.view.lines_at(self.clocks_rad, own))
         own_residual = edge_residuals(self.view, found, own).residual_px
         coherent = np.isfinite(own_residual) if found.is_by_hand else is_coherent(found.line, own_residual)
@@ -296,12 +296,18 @@ class OrientedCamera(FrameModel):
         place, sd = frame.features(self.features, self.view, own, REACH_PX)
         place, sd = frame.with_marked(self.features, (place, sd)) or (place, sd)
         has = np.flatnonzero(np.isfinite(sd))
-        points, across = self.features.points_shell_m[has], self.features.across_px[has]
-        offset, _, _ = self._at_benchmark(lines + has)
-        there, predicted = (self.view.sight(points, d).pixels for d in (own, tried))
-        off, residual = (place[has] - np.einsum("ni,ni->n", p, across) - offset for p in (there, predicted))
+        across = self.features.across_px[has]
+        (off, there), (residual, _) = (self._features_off(place, has, d) for d in (own, tried))
         at = there + off[:, None] * across
         return edge, np.column_stack([at, across, residual, np.abs(off) < OUTLIER_PX])
+
+    def _features_off(
+        self, place: FloatArray, rows: NDArray[np.intp], deformation: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Residuals (n,) of rows of features beyond the benchmark frame's, NaN where not found there; pixels (n, 2)."""
+        there = self.view.sight(self.features.points_shell_m[rows], deformation).pixels
+        offset, _, _ = self._at_benchmark(len(self.clocks_rad) + rows)
+        return place[rows] - np.einsum("ni,ni->n", there, self.features.across_px[rows]) - offset, there
 
     def _reconciled(
         self, frame: EditedFrame, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None,
@@ -360,21 +366,18 @@ class OrientedCamera(FrameModel):
         Hardly any of it may agree, or only what lies in a part of the picture, which then is another time's: the
         painted features must be where the texture puts the shell.
         """
-        features = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
-        if not isinstance(features, PaintedTexture) or painted is None:
+        if not isinstance(self.unmarked, PaintedTexture) or painted is None:
             return None
-        place, sd = np.zeros(len(self.features.across_px)), np.full(len(self.features.across_px), np.inf)
-        rows = slice(self.painted_rows, self.painted_rows + len(features.texture.across_px))
-        place[rows], sd[rows] = frame.features(features.texture, self.view, deformation, _NEAR_PAINT_PX)
+        texture, count = self.unmarked.texture, len(self.features.across_px)
+        place, sd = np.zeros(count), np.full(count, np.inf)
+        rows = slice(self.painted_rows, self.painted_rows + len(texture.across_px))
+        place[rows], sd[rows] = frame.features(texture, self.view, deformation, _NEAR_PAINT_PX)
         agreed, _, _ = self._agreeing((place, sd), deformation)
         if agreed is None or len(found_rows(agreed)) < _HARDLY_FEATURES * self.features_at_benchmark(painted=False):
             return None
         moved = deformation.copy()
         self._fit_points(_NOTHING, agreed, moved, np.eye(2))
-        has = found_rows(painted)
-        there = np.einsum("ni,ni->n", self.view.sight(self.features.points_shell_m[has], moved).pixels,
-                          self.features.across_px[has])  # fmt: skip
-        off = painted[0][has] - there - self._at_benchmark(len(self.clocks_rad) + has)[0]
+        off, _ = self._features_off(painted[0], found_rows(painted), moved)
         known = np.isfinite(off).sum()  # also found in the benchmark frame
         return agreed if (np.abs(off) < _PAINTED_PX).sum() > _LEAST_PAINTED * known else None
 

@@ -320,11 +320,15 @@ class FrameModel:
         """How many rows of the features, the first, are painted ones."""
         return 0 if self.painted is None else len(self.painted.across_px)
 
+    @property
+    def unmarked(self) -> Features:
+        """Features without those that an analyst marked."""
+        return self.features.found if isinstance(self.features, MarkedFeatures) else self.features
+
     @cached_property
     def painted(self) -> ImageFeatures | None:
         """Features of known places on the shell; None where there is texture, or nothing."""
-        found = self.features.found if isinstance(self.features, MarkedFeatures) else self.features
-        found = found.painted if isinstance(found, PaintedTexture) else found
+        found = self.unmarked.painted if isinstance(self.unmarked, PaintedTexture) else self.unmarked
         return found if isinstance(found, ImageFeatures) and len(found.points_shell_m) else None
 
     @property

@@ -30,6 +30,7 @@ estimation", 1996.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -205,12 +206,12 @@ class PaintedTexture:
     painted: ImageFeatures
     texture: TrackedTexture
 
-    @property
+    @cached_property
     def points_shell_m(self) -> FloatArray:
         """See `Features`."""
         return np.concatenate([self.painted.points_shell_m, self.texture.points_shell_m])
 
-    @property
+    @cached_property
     def across_px(self) -> FloatArray:
         """See `Features`."""
         return np.concatenate([self.painted.across_px, self.texture.across_px])

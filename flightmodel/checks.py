@@ -19,9 +19,9 @@ IntArray = NDArray[np.int64]
 Progress = Callable[[float, str], None]  # fraction done, and what is being done
 
 
-def part_of(report: Progress, number: int, parts: int) -> Progress:
-    """Report the progress of one of several parts as progress of the whole."""
-    return lambda fraction, what: report((number + fraction) / parts, what)
+def part_of(report: Progress, first: float, last: float) -> Progress:
+    """Progress of a part of the work, from one fraction of it to another."""
+    return lambda fraction, what: report(first + (last - first) * fraction, what)
 
 
 class Fault(str):

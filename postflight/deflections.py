@@ -297,7 +297,7 @@ def estimate(
             if method == "camera":
                 from postflight.filming import camera_answer, keep_oriented
 
-                filmed = seen() or camera_answer(flight, bet, part_of(report, k, len(methods)))
+                filmed = seen() or camera_answer(flight, bet, part_of(report, k / len(methods), (k + 1) / len(methods)))
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None:

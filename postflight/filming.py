@@ -235,9 +235,10 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     films: dict[str, FilmFit] = {}
     refused: dict[str, Fault] = {}
     of_flight = flight.telemetry.films
+    count = len(of_flight)
     # one after the other: in threads they take as long, for each holds the interpreter most of the time
     for k, (name, frames) in enumerate(of_flight.items()):
-        shown = None if progress is None else part_of(progress, k, len(of_flight))
+        shown = None if progress is None else part_of(progress, k / count, (k + 1) / count)
         try:
             films[name] = camera_film(flight, frames, shown)
         except GateError as fault:

@@ -38,7 +38,7 @@ from functools import cached_property
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, GateError, Progress
+from flightmodel.checks import DivergenceError, FloatArray, GateError, Progress, part_of
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import (
@@ -329,11 +329,6 @@ def _from_fit(problem: Problem, start: Parameters, report: Progress) -> JointFit
         per_s = joint.delayed_compliance_radpnm * joint.bending_stiffness_nmprad / joint.creep_time_s
         first = replace(first, problem=replace(problem, creep_per_s=per_s))
     return _refit_with_turbulence(first, part_of(report, 0.6, 1.0), correct)
-
-
-def part_of(report: Progress, first: float, last: float) -> Progress:
-    """Progress of a part of the work, from one fraction of it to another."""
-    return lambda fraction, what: report(first + (last - first) * fraction, what)
 
 
 def reconcile(

@@ -343,7 +343,8 @@ WINDOWS = 10  # a span
 SPAN_S = WINDOWS * WINDOW_S
 SPAN_MARGIN_M = 200.0  # of the air about a span, beside what it falls through
 LEAST_SPANS = 20
-LARGEST_PART, LEAST_PARTS = 16, 8  # blocks that a thread flies in a row, of about three spans; of few flights
+LARGEST_PART = 16  # blocks that a thread flies in a row: about three spans of a linearisation
+LEAST_PARTS = 8  # where there are blocks enough: a few for each thread
 LOADED = 0.1  # of the largest dynamic pressure
 # a priori sd of deflection and its rate (about x, y, z) at the first start: at rest above the atmosphere; under load
 REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])

@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.special import ndtr, ndtri
 
-from flightmodel.checks import ConfigError, FloatArray, Progress
+from flightmodel.checks import ConfigError, FloatArray, Progress, part_of
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
 from flightmodel.vehicle import Vehicle
-from postflight.reconciliation.fit import JointFit, LawSelection, part_of
+from postflight.reconciliation.fit import JointFit, LawSelection
 from postflight.reconciliation.forward_model import (
     DAMPING_LOG_SD,
     DEFLECTION,
