@@ -1,6 +1,6 @@
 """Compiled search for patches of the benchmark frame in another one; the model is in `estimators.texture`.
 
-Readable twin: OpenCV's ``matchTemplate`` with ``TM_CCOEFF_NORMED``, in ``tests/estimators/test_plain_twins.py``.
+Readable twin: ``tests/estimators/test_plain_twins.py``.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def correlations(picture, template, middle, affine, reach, score):
             upper = (1.0 - a) * picture[y, x] + a * picture[y, x + 1]
             window[i, j] = (1.0 - b) * upper + b * ((1.0 - a) * picture[y + 1, x] + a * picture[y + 1, x + 1])
     # sums over the patch: along rows, then of rows
-    steps, count = 2 * reach + 1, size * size
+    steps = 2 * reach + 1
     along = np.zeros((wide, steps, 2))
     for i in range(wide):
         for q in range(steps):
@@ -44,13 +44,11 @@ def correlations(picture, template, middle, affine, reach, score):
                 along[i, q, 1] += window[i, q + j] * window[i, q + j]
     for p in range(steps):
         for q in range(steps):
-            total, square, product = 0.0, 0.0, 0.0
+            spread, product = 0.0, 0.0
             for i in range(size):
-                total += along[p + i, q, 0]
-                square += along[p + i, q, 1]
+                spread += along[p + i, q, 1] - along[p + i, q, 0] * along[p + i, q, 0] / size
                 for j in range(size):
                     product += window[p + i, q + j] * template[i, j]
-            spread = square - total * total / count
             score[p, q] = product / math.sqrt(spread) if spread > 1e-9 else 0.0
     return True
 

@@ -71,9 +71,11 @@ TEXTURE_REACH_PX = 3  # the edge alone predicts to a pixel
 # sound frames of another renderer 0.86 at the least, where half of the picture is another time's 0.65 to 0.81
 _NEAR_PAINT_PX, _PAINTED_PX, _LEAST_PAINTED = 2, 1.0, 0.85
 _WORST_TEXTURE_SD_PX = 0.5  # as wide as what agrees: a less sharp patch cannot say whether it does
-TOGETHER = 3.0  # root of the number of patches that err together: they overlap, and their neighbours see the same light
-# by chance a sixth of the patches lie within half a pixel of six; of light and shade on plain cloth, which seem to move
-# as the Sun does, 0.55 do (median, 0.66 at the most), of eight paints 0.79 (median, 0.6 at the least)
+# root of the number of patches that err together: they overlap, and neighbours see the same light; the likeliest on ten
+# films of another renderer
+TOGETHER = 2.4
+# by chance a sixth of the patches lie within half a pixel of six. Of plain cloth hardly any are found, of these 0.61 at
+# the most (0.75 in the benchmark frame's light); of four paints 0.88 (median of 540 frames), 0.69 at the least
 _AGREED_PX, _LEAST_AGREED = 0.5, 0.6
 # what must agree on a turned camera where no deflection explains it, and how much more than with a deflection alone: of
 # light and shade 0.71 at the most, 0.13 more; of paint after the camera moved 0.6 to 0.9, 0.2 to 0.7 more
@@ -390,10 +392,10 @@ class OrientedCamera(FrameModel):
         best: tuple[float, FloatArray, _Approached] | None = None
         turned = False
         trouble = Fault("no edge near where one is expected", "edge-not-clear")
-        for guess in self._guesses(frame, deformation.copy()):
+        for guess, reaches_px in self._guesses(frame, deformation.copy()):
             moved = guess.copy()
             try:
-                seen = self._seen_from(frame, moved)
+                seen = self._seen_from(frame, moved, reaches_px)
             except NoFitError as fault:
                 trouble = fault.faults[0]
                 continue
@@ -412,16 +414,21 @@ class OrientedCamera(FrameModel):
         deformation[:] = best[1]
         return best[2]
 
-    def _guesses(self, frame: EditedFrame, start: FloatArray) -> Iterator[FloatArray]:
-        """Deformations (3,) near which the shell may be, the likeliest first; each is only made when asked for."""
-        yield start
+    def _guesses(self, frame: EditedFrame, start: FloatArray) -> Iterator[tuple[FloatArray, tuple[int, ...]]]:
+        """Deformations (3,) near which the shell may be, the likeliest first; each is only made when asked for.
+
+        With each, how far texture is looked for, first and then: where it need not be, shades are found that stay.
+        """
+        from_far = (REACH_PX, TEXTURE_REACH_PX)
+        yield start, from_far
         coarse = frame.far_edge(self.lines, self.view.camera.size_px)
         if coarse.is_usable:
             edge_alone = np.zeros(3)
             with suppress(NoFitError):
                 self._fit_points(coarse, None, edge_alone, np.eye(2))
-                yield edge_alone
-        yield from self._where_map_fits(frame.image, valleys(self.view), start)
+                yield edge_alone, (TEXTURE_REACH_PX, TEXTURE_REACH_PX)
+        for fitted in self._where_map_fits(frame.image, valleys(self.view), start):
+            yield fitted, from_far
 
     def _where_map_fits(self, image: Image, painted: ImageFeatures, start: FloatArray) -> Iterator[FloatArray]:
         """Deformation (3,) at which features fit the frame best, where that is significant."""
@@ -433,9 +440,9 @@ class OrientedCamera(FrameModel):
         if fitted is not None:
             yield np.array([*fitted, 0.0])
 
-    def _seen_from(self, frame: EditedFrame, deformation: FloatArray) -> _Approached:
+    def _seen_from(self, frame: EditedFrame, deformation: FloatArray, reaches_px: tuple[int, ...]) -> _Approached:
         """Texture and edge near a guess, which is moved in place to where they are; `NoFitError` without either."""
-        for reach in (REACH_PX, TEXTURE_REACH_PX):
+        for reach in reaches_px:
             found = frame.features(self.features, self.view, deformation, reach)
             if len(found_rows(found)) >= LEAST_FEATURES:
                 self._fit_points(_NOTHING, found, deformation, np.eye(2))

@@ -92,11 +92,6 @@ class Features(Protocol):
         """Unit vectors (n, 2) in the picture."""
         ...
 
-    @property
-    def alike(self) -> FloatArray:
-        """How far the light shifts each row (n,) together with its neighbours, over a mark's shift."""
-        ...
-
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
     ) -> tuple[FloatArray, FloatArray]:
@@ -135,11 +130,6 @@ class ImageFeatures:
     signs: FloatArray
     placed_m: float = 0.003
     offset_px: float = 0.0
-
-    @property
-    def alike(self) -> FloatArray:
-        """See `Features`."""
-        return np.ones(len(self.across_px))
 
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
@@ -222,7 +212,7 @@ def light_shift(view: VirtualCamera, features: Features) -> FloatArray:
     along = np.einsum("ni,ni->n", features.across_px, outwards) / np.linalg.norm(outwards, axis=1)
     clock = lv_clock(points[:, 1:])
     waves = np.column_stack([np.ones_like(clock), np.cos(clock), np.sin(clock)])
-    return np.asarray((features.alike * np.nan_to_num(along))[:, None] * waves)
+    return np.asarray(np.nan_to_num(along)[:, None] * waves)
 
 
 def no_features() -> ImageFeatures:

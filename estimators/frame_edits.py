@@ -62,11 +62,6 @@ class MarkedFeatures:
         """See `Features`."""
         return np.concatenate([self.found.across_px, np.tile(np.eye(2), (len(self.names), 1))])
 
-    @property
-    def alike(self) -> FloatArray:
-        """See `Features`: an analyst sees marks, not their shades."""
-        return np.concatenate([self.found.alike, np.zeros(2 * len(self.names))])
-
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
     ) -> tuple[FloatArray, FloatArray]:

@@ -488,7 +488,9 @@ class FrameModel:
 
     @cached_property
     def _light_shift(self) -> FloatArray:
-        return light_shift(self.view, self.features)
+        """Of rows (n, 3), painted features: texture leaves out what the light may shift, and an analyst sees marks."""
+        painted = np.arange(len(self.features.across_px)) < self.painted_rows
+        return np.where(painted[:, None], light_shift(self.view, self.features), 0.0)
 
     def _edge_step(self, both: Solution, flattening_rad: float) -> tuple[FloatArray, Solution]:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""

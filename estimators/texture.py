@@ -7,18 +7,21 @@ that affine map, and the template is searched in it by normalised cross correlat
 
     rho(e) = <T, S(e)> / (|T| |S(e)|),
 
-with the means removed: a change of exposure, of contrast or of a shadow's depth leaves it as it is. The highest
-correlation, refined by a parabola in two dimensions, is the patch's place. Its covariance is that of a fit of the
-template to itself in the noise that the correlation shows,
+with the mean of every row removed, and rows run along the shell's ring: what is the same along a ring may be the
+light's, whose bright ridges and valleys lie along the tori and move with the Sun by pixels. A change of exposure, of
+contrast or of a shadow's depth leaves it as it is. The highest correlation, refined by a parabola in two dimensions, is
+the patch's place. Its covariance is that of a fit of the template to itself in the noise that the correlation shows,
 
     cov(e) = (1 - rho^2) / (rho^2 N) (-rho'' / rho)^-1,      N independent samples of the patch,
 
 which is large along a line, the aperture's problem, and small across it. Both pictures are band-passed before: shades
 of light go, and noise finer than the lens's blur.
 
-Assumed: the light moves. A shadow's edge in the benchmark frame does not come along with the shell; such patches find
-nothing in another frame, or disagree with the rest, and Huber's weights see to them. Patches across the limb of a torus
-or the centerbody are not taken.
+Patches across the limb of a torus or the centerbody are not taken, nor those across a step of light along the ring,
+such as the edge of the centerbody's shadow, which stays with the Sun.
+
+Assumed: what else of light is in a patch, wrinkles that cast shades, finds nothing in another frame or disagrees with
+the rest, and Huber's weights see to it.
 
 References
 ----------
@@ -35,6 +38,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from estimators import _texture_kernels
 from estimators.features import ImageFeatures
@@ -53,20 +57,24 @@ _CELL_PX = 12  # one patch at the most in a square of this size, so that they sp
 # the same beside painted features: a sixth of the patches measures within a hundredth of a degree of all
 BESIDE_PAINT_PX = 32
 _STEP_M = 0.002  # along the touching plane, for the affine map
-_LEAST_CORRELATION = 0.8  # assumed; whether patches agree is tested afterwards
+# two templates of pure noise, of 26 independent samples, correlate so highly once in 10,000 places
+_LEAST_CORRELATION = 0.7
 _QUIET, _ABOVE_NOISE, _LEAST_GREY = 0.1, 3.0, 0.3  # quantile of plain cloth; a mark over its noise; rounding
 _BAND = 0.275  # of white noise that passes the band: root of (1/a^2 + 1/b^2 - 4/(a^2 + b^2)) / 4 pi of both blurs
 _LEAST_FACING = 0.3  # as of features
 _INDEPENDENT_PX = 4.0 * np.pi * _FINE_PX**2  # area over which the band-pass correlates noise
 _SD_FLOOR_PX = 0.05  # as of the edge
 _LINE = 3.0  # so much less sharp along a line than across it, a patch is found where it is looked for, or by its shades
-# of a mark's shift with the light, as found on another renderer's films: shades look like a line, hardly like a corner
-_ALIKE_OF_LINE, _ALIKE_OF_CORNER = 3.0, 0.5
 _TRACE_STEPS, _TRACED_M = 80, 5e-4  # of a ray to the surface: a sixth of a pixel at 310 px a radian and 1 m
 # of a mesh: a slope of 70 deg changes the distance over eight pixels by 7 % at 310 px; normals of a patch on one torus
 # differ by less than one
 _STEP_IN_DEPTH, _VALLEY = 0.1, 1.0
 _BORDER_PX = 12
+# brightest over darkest along the ring at a shadow's edge: another renderer's cloth is 5 times as bright in the Sun as
+# in the shade, its paints differ by 1.8. Where most patches show more it is the paint
+_SHADOW, _MOST = 3.0, 0.5
+_GRID_PX = 4  # between rays: tori are tens of pixels wide
+_ALONG_PX = np.arange(-6, 7, 3)  # along a ring over a patch; the band-pass leaves little finer than their step
 
 
 @dataclass(frozen=True)
@@ -144,12 +152,10 @@ class TrackedTexture:
         Unit vectors in the picture.
     tangents_shell : (n, 2, 3) float
         Unit vectors along the shell.
-    templates : (n, 15, 15) float32
-        Of mean zero and norm one.
+    templates : (n, 15, 15) float
+        Rows along the ring, each of mean zero; of norm one.
     to_tangents : (n, 2, 2) float
-        From an offset in the benchmark's picture to metres along the tangents.
-    is_line : (n,) bool
-        Patches that show a line and little else.
+        From an offset in the template, along its rows and its columns, px, to metres along the tangents.
     """
 
     points_shell_m: FloatArray
@@ -157,12 +163,6 @@ class TrackedTexture:
     tangents_shell: FloatArray = field(repr=False)
     templates: FloatArray = field(repr=False)
     to_tangents: FloatArray = field(repr=False)
-    is_line: BoolArray = field(repr=False)
-
-    @property
-    def alike(self) -> FloatArray:
-        """See `Features`: a line says less of its place than a corner does."""
-        return np.repeat(np.where(self.is_line, _ALIKE_OF_LINE, _ALIKE_OF_CORNER), 2)
 
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
@@ -181,7 +181,7 @@ class TrackedTexture:
         return place.ravel(), np.hypot(sd.ravel(), _SD_FLOOR_PX)
 
     def _predicted(self, view: VirtualCamera, deformation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Middle (n, 2) of each patch in the frame, and the map (n, 2, 2) from offsets in the benchmark's picture."""
+        """Middle (n, 2) of each patch in the frame, and the map (n, 2, 2) from offsets in the template."""
         points = self.points_shell_m[::2]
         n = len(points)
         beside = (points[:, None] + _STEP_M * self.tangents_shell).reshape(-1, 3)
@@ -216,11 +216,6 @@ class PaintedTexture:
         """See `Features`."""
         return np.concatenate([self.painted.across_px, self.texture.across_px])
 
-    @property
-    def alike(self) -> FloatArray:
-        """See `Features`."""
-        return np.concatenate([self.painted.alike, self.texture.alike])
-
     def find(
         self, view: VirtualCamera, image: Image, deformation: FloatArray, reach_px: int
     ) -> tuple[FloatArray, FloatArray]:
@@ -242,7 +237,8 @@ def texture_of(view: VirtualCamera, benchmark: Image, cell_px: int = _CELL_PX) -
         Side of the squares of which each has one patch at the most.
     """
     picture = band_passed(benchmark)
-    pixels = _spread_corners(benchmark, picture, _on_one_torus(view, benchmark.shape), cell_px)
+    grid = _Grid.of(view, benchmark.shape)
+    pixels = _spread_corners(benchmark, grid.without_rings(view, picture), grid.on_one_torus(view), cell_px)
     seen = surface_seen(view, pixels.astype(float))
     good = (seen.torus >= 0) & (seen.normals[:, 0] < 0.0)
     pixels, points, normals = pixels[good], seen.points_shell_m[good], seen.normals[good]
@@ -250,46 +246,89 @@ def texture_of(view: VirtualCamera, benchmark: Image, cell_px: int = _CELL_PX) -
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     facing = np.einsum("ni,ni->n", towards, normals) > _LEAST_FACING
     pixels, points, normals = pixels[facing], points[facing], normals[facing]
-    n = len(pixels)
+    along = _ring_directions(view, points)
+    axes = np.stack([along, np.column_stack([-along[:, 1], along[:, 0]])], axis=2)
+    lit = ~_across_shadow(_patches(benchmark, pixels, axes))
+    pixels, points, normals, axes = pixels[lit], points[lit], normals[lit], axes[lit]
+    templates = _patches(picture, pixels, axes)
+    templates -= templates.mean(axis=2, keepdims=True)
+    templates /= np.maximum(np.linalg.norm(templates, axis=(1, 2), keepdims=True), 1e-12)
+    across = np.array([_sharp_directions(t) @ own.T for t, own in zip(templates, axes, strict=True)]).reshape(-1, 2)
     round_shell = circumferential(points)
     tangents = np.stack([round_shell, np.cross(normals, round_shell)], axis=1)
-    around = np.arange(-HALF_PX, HALF_PX + 1)
-    templates = picture[pixels[:, 1, None, None] + around[:, None], pixels[:, 0, None, None] + around]
-    directions = [_sharp_directions(t) for t in templates]
-    across = np.array([axes for axes, _ in directions]).reshape(-1, 2)
-    is_line = np.array([ratio > _LINE for _, ratio in directions], dtype=np.bool_)
-    templates = templates - templates.mean(axis=(1, 2), keepdims=True)
-    templates = (templates / np.linalg.norm(templates, axis=(1, 2), keepdims=True)).astype(np.float64)
-    points = np.repeat(points, 2, axis=0)
-    unit = np.tile(np.eye(2), (n, 1, 1))
-    texture = TrackedTexture(points, across, tangents, templates, unit, is_line)
+    unit = np.tile(np.eye(2), (len(points), 1, 1))
+    texture = TrackedTexture(np.repeat(points, 2, axis=0), across, tangents, templates, unit)
     _, per_m = texture._predicted(view, np.zeros(3))
-    return replace(texture, to_tangents=np.asarray(np.linalg.inv(per_m), dtype=float))
+    return replace(texture, to_tangents=np.asarray(np.linalg.inv(per_m) @ axes, dtype=float))
 
 
-def _on_one_torus(view: VirtualCamera, shape: tuple[int, ...]) -> BoolArray:
-    """Mask (h, w) of pixels round which a whole patch shows one torus of the undeflected shell, or one face of a mesh's
+def _patches(picture: NDArray[np.generic], pixels: NDArray[np.int64], axes: FloatArray) -> FloatArray:
+    """Grey (n, 15, 15) about pixels (n, 2): rows along the first column of axes (n, 2, 2), columns along the other."""
+    around = np.arange(-HALF_PX, HALF_PX + 1)
+    column, row = np.meshgrid(around, around)
+    at = pixels[:, :, None, None] + axes[:, :, :1, None] * column + axes[:, :, 1:, None] * row
+    return np.asarray(map_coordinates(picture, at.transpose(1, 0, 2, 3)[::-1], output=float, order=1))
 
-    relief: no step in depth, and no valley, across which the normals differ.
-    """
-    h, w = shape
-    step = 4  # px between rays: tori are tens of pixels wide
-    u, v = np.meshgrid(np.arange(0, w, step), np.arange(0, h, step))
-    seen = surface_seen(view, np.column_stack([u.ravel(), v.ravel()]).astype(float))
-    torus = seen.torus.reshape(u.shape).astype(np.float32)
-    kernel = np.ones((2 * (-(-HALF_PX // step)) + 1,) * 2, np.uint8)
-    same = (cv2.erode(torus, kernel) == cv2.dilate(torus, kernel)) & (torus >= 0.0)
-    if view.undeflected is not None:
-        away = np.linalg.norm(seen.points_shell_m - view.camera.position_body_m, axis=1).reshape(u.shape)
-        whole = _spread(away, np.ones((3, 3), np.uint8)) < _STEP_IN_DEPTH * away
-        same &= cv2.erode(whole.astype(np.uint8), kernel) > 0
-        for part in seen.normals.T:
-            same &= _spread(part.reshape(u.shape), kernel) < _VALLEY
-    mask = cv2.resize(same.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
-    margin = HALF_PX + _BORDER_PX
-    out = np.zeros(shape, dtype=np.bool_)
-    out[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin] > 0
-    return out
+
+def _across_shadow(patches: FloatArray) -> BoolArray:
+    """Whether patches (n, 15, 15) of grey lie across a shadow's edge; of none where so much of the shell is painted."""
+    along = np.maximum(patches.mean(axis=1), 1.0)
+    steps = along.max(axis=1, initial=1.0) > _SHADOW * along.min(axis=1, initial=np.inf)
+    return steps & (float(steps.mean() if len(steps) else 0.0) < _MOST)
+
+
+def _ring_directions(view: VirtualCamera, points: FloatArray) -> FloatArray:
+    """Unit vectors (n, 2) in the benchmark's picture along the shell's rings at points (n, 3) of it."""
+    step = _STEP_M * circumferential(points)
+    ends = [view.sight(points + side * step, np.zeros(3)).pixels for side in (-1.0, 1.0)]
+    along = ends[1] - ends[0]
+    return np.asarray(along / np.linalg.norm(along, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """What a grid of pixels (a, b) of a picture (h, w) looks at."""
+
+    shape: tuple[int, int]
+    steps: tuple[int, int]
+    seen: SurfacePoints
+
+    @staticmethod
+    def of(view: VirtualCamera, shape: tuple[int, ...]) -> _Grid:
+        h, w = shape
+        u, v = np.meshgrid(np.arange(0, w, _GRID_PX), np.arange(0, h, _GRID_PX))
+        return _Grid((h, w), u.shape, surface_seen(view, np.column_stack([u.ravel(), v.ravel()]).astype(float)))
+
+    def without_rings(self, view: VirtualCamera, picture: Picture) -> Picture:
+        """Picture less its mean along the rings over a patch, which may be the light's."""
+        along, hit = np.zeros((len(self.seen.torus), 2)), self.seen.torus >= 0
+        along[hit] = np.nan_to_num(_ring_directions(view, self.seen.points_shell_m[hit]))
+        h, w = self.shape
+        ring = cv2.resize(along.reshape(*self.steps, 2).astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR)
+        at = np.stack(np.meshgrid(np.arange(w), np.arange(h)), axis=-1).astype(np.float32)
+        parts = [cv2.remap(picture, at + np.float32(k) * ring, None, cv2.INTER_LINEAR) for k in _ALONG_PX]
+        return np.asarray(picture - np.mean(parts, axis=0), dtype=np.float32)
+
+    def on_one_torus(self, view: VirtualCamera) -> BoolArray:
+        """Mask (h, w) of pixels round which a whole patch shows one torus of the undeflected shell, or one face of a
+
+        mesh's relief: no step in depth, and no valley, across which the normals differ.
+        """
+        h, w = self.shape
+        torus = self.seen.torus.reshape(self.steps).astype(np.float32)
+        kernel = np.ones((2 * (-(-HALF_PX // _GRID_PX)) + 1,) * 2, np.uint8)
+        same = (cv2.erode(torus, kernel) == cv2.dilate(torus, kernel)) & (torus >= 0.0)
+        if view.undeflected is not None:
+            away = np.linalg.norm(self.seen.points_shell_m - view.camera.position_body_m, axis=1).reshape(self.steps)
+            whole = _spread(away, np.ones((3, 3), np.uint8)) < _STEP_IN_DEPTH * away
+            same &= cv2.erode(whole.astype(np.uint8), kernel) > 0
+            for part in self.seen.normals.T:
+                same &= _spread(part.reshape(self.steps), kernel) < _VALLEY
+        mask = cv2.resize(same.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
+        margin = HALF_PX + _BORDER_PX
+        out = np.zeros(self.shape, dtype=np.bool_)
+        out[margin:-margin, margin:-margin] = mask[margin:-margin, margin:-margin] > 0
+        return out
 
 
 def _spread(picture: FloatArray, kernel: NDArray[np.uint8]) -> FloatArray:
@@ -324,9 +363,8 @@ def noise_of(image: Image) -> float:
     return NORMAL_MAD * float(np.median(np.abs(second))) / 6.0
 
 
-def _sharp_directions(template: Picture) -> tuple[FloatArray, float]:
-    """Unit vectors (2, 2) of a patch's structure tensor, the sharper first, and how many times sharper that is."""
-    gv, gu = np.gradient(template.astype(float))
+def _sharp_directions(template: FloatArray) -> FloatArray:
+    """Unit vectors (2, 2) of a patch's structure tensor along its rows and columns, the sharper first."""
+    gv, gu = np.gradient(template)
     tensor = np.array([[np.sum(gu * gu), np.sum(gu * gv)], [np.sum(gu * gv), np.sum(gv * gv)]])
-    value, axes = np.linalg.eigh(tensor)
-    return np.asarray(axes.T[::-1]), float(np.sqrt(value[1] / max(value[0], 1e-9 * value[1])))
+    return np.asarray(np.linalg.eigh(tensor)[1].T[::-1])

@@ -380,17 +380,24 @@ def patch_of(rng):
     grey = cv2.GaussianBlur(rng.standard_normal((60, 64)), (0, 0), 2.0)
     picture = np.ascontiguousarray(grey / grey.std(), dtype=np.float32)
     template = picture[24:35, 27:38].astype(float)
-    template = template - template.mean()
+    template = template - template.mean(axis=1, keepdims=True)
     return picture, template / np.linalg.norm(template)
 
 
-def test_correlation_of_a_patch_is_opencv_s():
+def test_correlation_of_a_patch_leaves_out_what_is_the_same_along_its_rows():
     picture, template = patch_of(np.random.default_rng(1))
     reach, score = 4, np.empty((9, 9))
     assert _texture_kernels.correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
-    window = picture[31 - 9 : 31 + 10, 34 - 9 : 34 + 10]
-    expected = cv2.matchTemplate(window, template.astype(np.float32), cv2.TM_CCOEFF_NORMED)
-    np.testing.assert_allclose(score, expected, atol=1e-5)
+    expected = np.empty((9, 9))
+    for v, u in np.ndindex(9, 9):
+        there = picture[22 + v : 33 + v, 25 + u : 36 + u].astype(float)
+        there -= there.mean(axis=1, keepdims=True)
+        expected[v, u] = np.sum(template * there) / np.linalg.norm(there)
+    np.testing.assert_allclose(score, expected, atol=1e-6)
+    shaded = picture + np.linspace(0.0, 9.0, 60, dtype=np.float32)[:, None] ** 2
+    again = np.empty((9, 9))
+    assert _texture_kernels.correlations(shaded, template, np.array([34.0, 31.0]), np.eye(2), reach, again)
+    np.testing.assert_allclose(again, score, atol=1e-5)
     assert not _texture_kernels.correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
 
 
@@ -409,7 +416,7 @@ def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
         )
         # a small window's own energy changes as it is shifted, which moves a parabola's top by a tenth of a pixel
         np.testing.assert_allclose(place[0], np.array([32.0, 29.0]) + off, atol=0.15)
-        assert (sd < 0.3).all()
+        assert (sd < 0.4).all()
 
 
 def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():

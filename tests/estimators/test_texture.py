@@ -92,6 +92,39 @@ def test_noise_alone_is_no_texture():
     assert len(texture_of(VIEW, np.full((480, 720), 90, dtype=np.uint8)).templates) == 0
 
 
+def test_light_along_the_tori_that_moves_does_not_move_a_patch():
+    v, u = np.mgrid[:480, :720].astype(float)
+    along = surface_seen(VIEW, np.column_stack([u.ravel(), v.ravel()])).normals[:, 0].reshape(480, 720)
+    paint = cloth(np.random.default_rng(5)).astype(float)
+    lit = [1.0 + 0.4 * np.sin(9.0 * along + phase) for phase in (0.0, 1.5)]
+    before, after = (np.clip(paint * shade, 0, 255).astype(np.uint8) for shade in lit)
+    texture = texture_of(VIEW, before)
+    place, sd = texture.find(VIEW, after, np.zeros(3), 3)
+    there = np.einsum("ni,ni->n", VIEW.sight(texture.points_shell_m, np.zeros(3)).pixels, texture.across_px)
+    found = np.isfinite(sd)
+    assert found.mean() > 0.7
+    off = (place - there)[found]
+    assert np.abs(off.mean()) < 0.05  # the least sd of a place
+    assert np.std(off) < 0.2
+
+
+def test_no_patch_lies_across_a_shadow_s_edge_but_where_the_shell_is_painted_so():
+    picture = cloth(np.random.default_rng(6)).astype(float)
+    shaded, painted = picture.copy(), picture.copy()
+    shaded[:, 330:400] *= 0.2
+    columns = np.arange(720) // 10 % 2 == 0
+    painted[:, columns] *= 0.2
+
+    def columns_of(grey):
+        texture = texture_of(VIEW, grey.astype(np.uint8))
+        return VIEW.sight(texture.points_shell_m, np.zeros(3)).pixels[::2, 0]
+
+    for edge in (330.0, 400.0):
+        assert (np.abs(columns_of(picture) - edge) < 4.0).any()
+        assert not (np.abs(columns_of(shaded) - edge) < 4.0).any()
+    assert len(columns_of(painted)) > 0.5 * len(columns_of(picture))
+
+
 def test_behind_painted_features_the_texture_measures_where_most_of_it_agrees():
     frames = film(7, [0.0, 3.0, 4.0], [0.0, 160.0, 150.0])
     oriented = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
