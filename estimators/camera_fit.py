@@ -374,11 +374,10 @@ class OrientedCamera(FrameModel):
         place, sd = np.zeros(count), np.full(count, np.inf)
         rows = slice(self.painted_rows, self.painted_rows + len(texture.across_px))
         place[rows], sd[rows] = frame.features(texture, self.view, deformation, _NEAR_PAINT_PX)
-        agreed, _, _ = self._agreeing((place, sd), deformation)
+        moved = deformation.copy()
+        agreed, _, _ = self._agreeing((place, sd), moved)
         if agreed is None or len(found_rows(agreed)) < _HARDLY_FEATURES * self.features_at_benchmark(painted=False):
             return None
-        moved = deformation.copy()
-        self._fit_points(_NOTHING, agreed, moved, np.eye(2))
         off, _ = self._features_off(painted[0], found_rows(painted), moved)
         known = np.isfinite(off).sum()  # also found in the benchmark frame
         return agreed if (np.abs(off) < _PAINTED_PX).sum() > _LEAST_PAINTED * known else None
@@ -446,7 +445,7 @@ class OrientedCamera(FrameModel):
             found = frame.features(self.features, self.view, deformation, reach)
             if len(found_rows(found)) >= LEAST_FEATURES:
                 self._fit_points(_NOTHING, found, deformation, np.eye(2))
-        place, agreed, is_turned = self._agreeing(found, deformation)
+        place, agreed, is_turned = self._agreeing(found, deformation.copy())
         if place is not None:
             self._fit_points(_NOTHING, place, deformation, np.eye(2))
         near = self.coherent_edge(frame, deformation)
@@ -469,13 +468,13 @@ class OrientedCamera(FrameModel):
     ) -> tuple[tuple[FloatArray, FloatArray] | None, float, bool]:
         """Places of the texture that agree on one deformation, None where too few do; the share that does.
 
-        Last: whether they agree on a turn of the camera instead.
+        ``deformation`` is moved there. Last: whether they agree on a turn of the camera instead.
         """
         sharp = found[0], np.where(found[1] < _WORST_TEXTURE_SD_PX, found[1], np.inf)
         has = found_rows(sharp)
         if len(has) < LEAST_FEATURES:
             return None, 0.0, False
-        fitted = self._fit_points(_NOTHING, sharp, deformation.copy(), np.eye(2))
+        fitted = self._fit_points(_NOTHING, sharp, deformation, np.eye(2))
         off = np.abs(fitted.left_px[has])
         agreed = float(np.mean(off < _AGREED_PX))
         if agreed < _LEAST_AGREED:

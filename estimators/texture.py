@@ -32,6 +32,7 @@ estimation", 1996.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -53,9 +54,10 @@ Picture = NDArray[np.float32]
 
 HALF_PX = 7  # of a patch: at most a third of a torus as a camera on the centerbody sees it
 _FINE_PX, _COARSE_PX = 0.8, 2.0  # of the band-pass: the lens's blur, and less than the patch
+_WINDOWS = [cv2.getGaussianKernel(2 * math.ceil(2.5 * sd) + 1, sd) for sd in (_FINE_PX, _COARSE_PX)]
 _CELL_PX = 12  # one patch at the most in a square of this size, so that they spread over the shell
 # the same beside painted features: a sixth of the patches measures within a hundredth of a degree of all
-BESIDE_PAINT_PX = 32
+BESIDE_PAINT_PX = 48
 _STEP_M = 0.002  # along the touching plane, for the affine map
 # two templates of pure noise, of 26 independent samples, correlate so highly once in 10,000 places
 _LEAST_CORRELATION = 0.7
@@ -135,8 +137,7 @@ def _mesh_seen(view: VirtualCamera, rendered: Rendered, pixels: FloatArray) -> S
 
 def band_passed(image: Image) -> Picture:
     """Picture without shades and without noise finer than the lens's blur."""
-    grey = image.astype(np.float32)
-    fine, coarse = (cv2.GaussianBlur(grey, (0, 0), sd) for sd in (_FINE_PX, _COARSE_PX))
+    fine, coarse = (cv2.sepFilter2D(image, cv2.CV_32F, window, window) for window in _WINDOWS)
     return fine - coarse
 
 
