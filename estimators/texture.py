@@ -54,7 +54,7 @@ Picture = NDArray[np.float32]
 
 HALF_PX = 7  # of a patch: at most a third of a torus as a camera on the centerbody sees it
 _FINE_PX, _COARSE_PX = 0.8, 2.0  # of the band-pass: the lens's blur, and less than the patch
-_WINDOWS = [cv2.getGaussianKernel(2 * math.ceil(2.5 * sd) + 1, sd) for sd in (_FINE_PX, _COARSE_PX)]
+_WINDOWS = [cv2.getGaussianKernel(2 * math.ceil(3.0 * sd) + 1, sd) for sd in (_FINE_PX, _COARSE_PX)]
 _CELL_PX = 12  # one patch at the most in a square of this size, so that they spread over the shell
 # the same beside painted features: a sixth of the patches measures within a hundredth of a degree of all
 BESIDE_PAINT_PX = 48
