@@ -8,14 +8,17 @@ before a shell in shadow, nothing is said.
 A camera that turns about a point near the edge, or moves along it, leaves many points within a pixel: then it counts
 how many more lie where one shift and turn of the picture puts them.
 
-Assumed: the body's own shadow beside its edge, which may pass for the edge, leaves a part of the edge alone. Of 707
-frames of 66 sound films one keeps less than a tenth of its points; of a camera that moved hardly any stay. A shift and
-turn alone are not sure of one frame: light and shadow that shift a part of the edge may look like one.
+The body's own shadow beside its edge may pass for the edge, in the benchmark frame in all other frames. A camera that
+moved moves the picture of the shell too: where that does not follow, nothing has moved (`MountMotion.of_points`).
+
+Assumed: without features, the shadow leaves a part of the edge alone. Of 707 frames of 66 sound films one keeps less
+than a tenth of its points; of a camera that moved hardly any stay. A shift and turn alone are not sure of one frame:
+light and shadow that shift a part of the edge may look like one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -40,6 +43,36 @@ _TOWARDS_PX = (8.0, 5.6, 4.0, 2.8, 2.0, 1.4, 1.0, 0.7, 0.7, 0.7)  # scale of the
 
 
 @dataclass(frozen=True)
+class MountMotion:
+    """How the centerbody's edge has moved in the picture since the benchmark frame.
+
+    Parameters
+    ----------
+    px : float
+        How far; zero where it has not, NaN where the picture does not show it.
+    is_sure : bool
+        Whether that is sure of this frame by itself.
+    about_px, shift_px : (2,) float
+    turn_rad : float
+        The motion of the picture that most of the edge follows: a shift, and a turn to the right about a point.
+    """
+
+    px: float
+    is_sure: bool
+    about_px: FloatArray = field(default_factory=lambda: np.zeros(2))
+    shift_px: FloatArray = field(default_factory=lambda: np.zeros(2))
+    turn_rad: float = 0.0
+
+    def of_points(self, places_px: FloatArray, across: FloatArray) -> FloatArray:
+        """By how much (n,) it moves points (n, 2) of the picture along unit vectors (n, 2)."""
+        u, v = (places_px - self.about_px).T
+        return np.asarray(across @ self.shift_px + self.turn_rad * (across[:, 1] * u - across[:, 0] * v))
+
+
+UNMOVED = MountMotion(0.0, True)
+
+
+@dataclass(frozen=True)
 class BodyEdge:
     """The centerbody's silhouette in the benchmark frame.
 
@@ -54,24 +87,24 @@ class BodyEdge:
     lines: ScanLines
     place_px: FloatArray
 
-    def moved_px(self, picture: KeptPicture, clear: BoolArray) -> tuple[float, bool]:
-        """How far the edge has moved since; zero where it has not, NaN where the picture does not show it.
-
-        Last: whether that is sure of this frame by itself. ``clear`` (n,): lines that nothing hides.
-        """
+    def moved(self, picture: KeptPicture, clear: BoolArray) -> MountMotion:
+        """How the edge has moved since. ``clear`` (n,): lines that nothing hides."""
         moved = _places(picture, self.lines) - self.place_px
         seen = clear & np.isfinite(moved)
         moved = moved[seen]
         if len(moved) < _LEAST_POINTS:
-            return float("nan"), False
+            return MountMotion(float("nan"), False)
         same = np.count_nonzero(np.abs(moved) < _SAME_PX) / len(moved)
+        if same >= _MOST_SAME:
+            return UNMOVED
+        places, out = self.lines.origin_px[seen], self.lines.inward_px[seen]
+        followed = _followed(places, out, moved)
         if same < _LEAST_SAME:
-            return float(np.median(np.abs(moved))), True
-        if same < _MOST_SAME:
-            together = _moved_together(self.lines.origin_px[seen], self.lines.inward_px[seen], moved)
-            if np.mean(np.abs(moved - together) < _SAME_PX) > same + _MORE_MOVED:
-                return float(np.abs(together).max()), False
-        return 0.0, True
+            return replace(followed, px=float(np.median(np.abs(moved))), is_sure=True)
+        together = followed.of_points(places, out)
+        if np.mean(np.abs(moved - together) < _SAME_PX) > same + _MORE_MOVED:
+            return replace(followed, px=float(np.abs(together).max()))
+        return UNMOVED
 
 
 def body_edge(view: VirtualCamera, picture: KeptPicture) -> BodyEdge | None:
@@ -119,16 +152,18 @@ def _places(picture: KeptPicture, lines: ScanLines) -> FloatArray:
     return place
 
 
-def _moved_together(places_px: FloatArray, out: FloatArray, moved_px: FloatArray) -> FloatArray:
-    """Shift of points (n,) along ``out`` (n, 2) by the shift and turn of the picture that most of them follow.
+def _followed(places_px: FloatArray, out: FloatArray, moved_px: FloatArray) -> MountMotion:
+    """Shift and turn of the picture that most points (n, 2), moved by (n,) along ``out`` (n, 2), follow.
 
     Geman and McClure's weights, their scale narrowed step by step, so that the start does not matter.
     """
-    off = places_px - places_px.mean(axis=0)
-    turn = out[:, 1] * off[:, 0] - out[:, 0] * off[:, 1]
-    by = np.column_stack([out, turn / max(float(np.abs(turn).max()), 1.0)])
-    together = np.zeros(len(moved_px))
+    about = places_px.mean(axis=0)
+    u, v = (places_px - about).T
+    arm = out[:, 1] * u - out[:, 0] * v
+    longest = max(float(np.abs(arm).max()), 1.0)
+    by = np.column_stack([out, arm / longest])
+    motion: FloatArray = np.zeros(3)
     for scale in _TOWARDS_PX:
-        weight = 1.0 / (1.0 + ((moved_px - together) / scale) ** 2)
-        together = by @ np.linalg.lstsq(by * weight[:, None], moved_px * weight, rcond=None)[0]
-    return together
+        weight = 1.0 / (1.0 + ((moved_px - by @ motion) / scale) ** 2)
+        motion = np.asarray(np.linalg.lstsq(by * weight[:, None], moved_px * weight, rcond=None)[0], dtype=float)
+    return MountMotion(float("nan"), False, about, motion[:2], float(motion[2]) / longest)

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.body_edge import UNMOVED, MountMotion
 from estimators.edge import (
     NO_FAULT,
     HorizonLine,
@@ -148,7 +149,7 @@ class OrientedCamera(FrameModel):
         deformation, basis, horizon, doubled, moved_var = np.zeros(3), np.eye(2), _NOTHING, 0.0, 0.0
         deformation[:2] = 0.0 if start is None else start
         with_open_plane: FrameFit | None = None
-        mount_px, mount_is_sure = self._mount_px(frame)
+        mount = self._mount(frame)
         try:
             if self.painted is not None:
                 place = self._approach(frame, deformation, self.painted)
@@ -166,9 +167,11 @@ class OrientedCamera(FrameModel):
                     self._check_seen(horizon, last)
                 doubled = self._doubled(frame, horizon, deformation)
                 self._check_sharp(frame, horizon)
-                if mount_px > 0.0 and mount_is_sure:
+                if mount.px > 0.0 and self._stays(mount, last):
+                    mount = UNMOVED
+                if mount.px > 0.0 and mount.is_sure:
                     raise NoFitError(
-                        f"the centerbody's own edge has moved by {mount_px:.1f} px since the benchmark frame: the "
+                        f"the centerbody's own edge has moved by {mount.px:.1f} px since the benchmark frame: the "
                         "camera moved in its mount, or the picture was moved",
                         "camera-turned",
                     )
@@ -184,10 +187,10 @@ class OrientedCamera(FrameModel):
                 deformation[:] = *(basis[:, 0] * (basis[:, 0] @ deformation[:2])), 0.0
                 last = self._solve(horizon, None, deformation, basis, np.inf)
         except NoFitError as refusal:
-            return refused_fit(horizon, refusal.faults[0], mount_px, mount_is_sure)
+            return refused_fit(horizon, refusal.faults[0], mount.px, mount.is_sure)
         answer = self._answer(horizon, deformation, last, basis, moved_var)
         return replace(
-            answer, contradicted=contradicted, doubled=doubled, mount_px=mount_px, mount_is_sure=mount_is_sure,
+            answer, contradicted=contradicted, doubled=doubled, mount_px=mount.px, mount_is_sure=mount.is_sure,
             with_open_plane=with_open_plane,
             noise=None if self.noise_places is None else self.noise_places.noise(frame, deformation[:2]),
         )  # fmt: skip
@@ -221,16 +224,29 @@ class OrientedCamera(FrameModel):
 
     def _check_explained(self, last: Solution) -> float:
         """Refuse a frame that no deflection explains; variance of one that may be moved: `estimators.frame_checks`."""
-        rows, focal = last.rows, float(self.view.camera.focal_px[0])
-        design = Design(
-            last.columns, last.formal, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight,
-            last.edge_count,
-        )  # fmt: skip
+        design = self._design(last)
         shape = last.shape_found / self._shape_sd
         fault, variance = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
         if fault:
             raise NoFitError(fault)
         return variance
+
+    def _design(self, last: Solution) -> Design:
+        rows, focal = last.rows, float(self.view.camera.focal_px[0])
+        return Design(
+            last.columns, last.formal, rows[:, TURN], rows[:, CENTRE], focal, last.residual_px, last.weight,
+            last.edge_count,
+        )  # fmt: skip
+
+    def _stays(self, mount: MountMotion, last: Solution) -> bool:
+        """Whether edge and features do not follow a motion of the centerbody's edge, which then is a shadow's.
+
+        Of one that is farther than features are looked for, it is not known what was found.
+        """
+        design, camera = self._design(last), self.view.camera
+        places = camera.centre_px + design.focal_px * np.column_stack(design.places)
+        moved = mount.of_points(places, design.across)
+        return bool(np.abs(moved).max() < REACH_PX) and design.speaks_against(moved)
 
     def _shows_most(self, rows: NDArray[np.intp]) -> bool:
         """Whether the rows (n,) of features found are enough, and most of what the benchmark frame shows of theirs."""
@@ -271,11 +287,10 @@ class OrientedCamera(FrameModel):
                 "edge-blurred",
             )
 
-    def _mount_px(self, frame: EditedFrame) -> tuple[float, bool]:
-        """How far the camera has moved in its mount, NaN where unknown, and whether that is sure: `BodyEdge`."""
+    def _mount(self, frame: EditedFrame) -> MountMotion:
         if self.body is None:
-            return float("nan"), False
-        return self.body.moved_px(frame.kept, frame.is_clear(self.body.lines.origin_px))
+            return MountMotion(float("nan"), False)
+        return self.body.moved(frame.kept, frame.is_clear(self.body.lines.origin_px))
 
     def points_at(
         self, picture: Image | EditedFrame, own: FloatArray, tried: FloatArray

@@ -19,7 +19,7 @@ Assumed: the camera is fixed to the centerbody, its lens too. Edge points alone 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +32,8 @@ USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
 # chi-square that one sound frame in 10,000 exceeds: of seventeen of shape and light, of three rotations and a focal
 # length, of twelve terms of a warp, of two components of deflection
 WORST_SHAPE, _WORST_TURN, _WORST_WARP, _WORST_HALVES = 47.6, 23.5, 39.1, 18.4
+_WORST_ONE = 10.8  # of one, that a sound frame in 1000 exceeds
+_MOTION_OFF = 0.1  # of the centerbody's edge, whose light and shadow the motion was found in: what it may be off
 _WORST_TOGETHER = 72.0  # of the thirty-three of shape, turn and warp
 # sd of a half's deflection by shapes that are not modelled and points that err alike: with it the chi-square of two is
 # 1.5 at the most in 216 fits of sound frames, 8.6 in some of another renderer's, 8 to 90 in frames of which rows slip
@@ -96,6 +98,16 @@ class Design:
             for at in (place[self.edge_points :] for place in self.places)
         )
         return self.columns[:, :2] * left[:, None], self.columns[:, :2] * upper[:, None]
+
+    def speaks_against(self, moved_px: FloatArray) -> bool:
+        """Whether the points lie where they would without a motion of the picture, known from elsewhere, by (n,) px.
+
+        Both are tested by how much of that motion the residuals show: none, or all.
+        """
+        by = moved_px[:, None]
+        _, without = self.motion(by, _MOTION_OFF)
+        _, with_it = replace(self, residual_px=self.residual_px - moved_px).motion(by, _MOTION_OFF)
+        return with_it > without + _WORST_ONE
 
     def motion(self, by: FloatArray, allowed: float) -> tuple[FloatArray, float]:
         """Motion (m,) that explains the residuals best, with derivatives (n, m), and its chi-square.

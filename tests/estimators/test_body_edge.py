@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from estimators.benchmark import orient_camera
-from estimators.body_edge import _moved_together, body_edge
+from estimators.body_edge import UNMOVED, _followed, body_edge
 from estimators.camera import without_moved
 from estimators.edge import KeptPicture, no_horizon
 from estimators.frame_solution import refused_fit
@@ -56,8 +56,8 @@ def test_where_nothing_is_seen_of_it_nothing_is_said(frames, oriented):
     lines = oriented.body.lines
     bare = cv2.GaussianBlur(frames[1], (0, 0), 25.0)
     everywhere = np.ones(len(lines.index), dtype=bool)
-    assert np.isnan(oriented.body.moved_px(KeptPicture(bare), everywhere)[0])
-    assert np.isnan(oriented.body.moved_px(KeptPicture(moved(frames[1], (0.0, -6.0))), ~everywhere)[0])
+    assert np.isnan(oriented.body.moved(KeptPicture(bare), everywhere).px)
+    assert np.isnan(oriented.body.moved(KeptPicture(moved(frames[1], (0.0, -6.0))), ~everywhere).px)
     assert body_edge(oriented.view, KeptPicture(bare)) is None
 
 
@@ -93,7 +93,8 @@ def test_the_motion_is_that_of_most_points(oriented):
     found = true + 0.2 * rng.standard_normal(len(true))
     other = rng.random(len(true)) < 0.33
     found[other] = rng.uniform(-24.0, 24.0, other.sum())
-    together = _moved_together(lines.origin_px, lines.inward_px, found)
+    followed = _followed(lines.origin_px, lines.inward_px, found)
+    together = followed.of_points(lines.origin_px, lines.inward_px)
     np.testing.assert_allclose(together, true, atol=0.25)
     assert np.abs(true).max() > 3.0
 
@@ -102,6 +103,24 @@ def test_little_of_it_in_view_is_enough(frames, oriented):
     """100 px of it, as a camera that sees no more than a corner."""
     column = oriented.body.lines.origin_px[:, 0]
     corner = (column > 520.0) & (column < 620.0)
-    assert oriented.body.moved_px(KeptPicture(frames[1]), corner) == (0.0, True)
+    assert oriented.body.moved(KeptPicture(frames[1]), corner) is UNMOVED
     elsewhere = KeptPicture(moved(frames[1], (0.0, -6.0)))
-    assert oriented.body.moved_px(elsewhere, corner)[0] == pytest.approx(6.0, abs=0.7)
+    assert oriented.body.moved(elsewhere, corner).px == pytest.approx(6.0, abs=0.7)
+
+
+def test_an_edge_that_moves_alone_is_a_shadow(frames):
+    """Beside the benchmark frame's edge lay the body's own shadow; what the shell's features show has not moved."""
+    with_features = orient_camera(frames[0], GEOMETRY, MOUNT, JOINT_M)
+    place, column = with_features.body.place_px, with_features.body.lines.origin_px[:, 0]
+    at, to = np.quantile(column[np.isfinite(place)], [0.9, 0.0])
+    shaded = replace(with_features.body, place_px=place + 6.0 * np.clip((at - column) / (at - to), 0.0, 1.0))
+    picture = KeptPicture(frames[1])
+    assert shaded.moved(picture, np.ones(len(place), dtype=bool)).px > 2.0
+    fit = replace(with_features, body=shaded).fit(frames[1])
+    assert not fit.refused
+    assert fit.mount_px == 0.0
+    # the same motion of a camera, which all of the picture shows
+    turned = moved(frames[1], (0.0, -1.5), 0.25)
+    assert with_features.body.moved(KeptPicture(turned), np.ones(len(place), dtype=bool)).px > 1.5
+    spoilt = with_features.fit(turned)
+    assert spoilt.refused or spoilt.mount_px > 1.5
