@@ -41,7 +41,7 @@ chapters 2 and 5.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -258,28 +258,36 @@ def _oriented(
     nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd,
     features_of: Callable[[VirtualCamera], ImageFeatures],
 ) -> OrientedCamera:  # fmt: skip
-    """Fit from the nominal pose and, where that is not sound, from where the feature map fits."""
-    try:
-        oriented = _fitted(nominal, benchmark, prior, apriori, np.zeros(_POSES), _REACHES_PX, features_of)
-        if oriented.support > USUAL_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
-            return oriented
-        trouble = None
-    except GateError as no_edge:
-        oriented, trouble = None, no_edge
-    # the edge may have been the Earth's: features and the valleys between tori are the shell's alone
-    pose = _pose_of_feature_map(nominal, benchmark.image, prior, features_of(nominal))
-    if pose is not None:
+    """Fit from the nominal pose and, where that is not sound, near it alone and from where the feature map fits.
+
+    The edge seen from far may have been the Earth's; features and the valleys between tori are the shell's alone.
+    """
+    found: list[OrientedCamera] = []
+    trouble: GateError | None = None
+    for pose, reaches_px, from_map in _starts(nominal, benchmark, prior, features_of):
         try:
-            other = _fitted(nominal, benchmark, prior, apriori, pose, _REACHES_PX[1:], features_of)
-        except GateError as fault_of_map:
-            trouble = trouble or fault_of_map
-        else:
-            if oriented is None or other.support / other.residual_rms_px > oriented.support / oriented.residual_rms_px:
-                return other
-    if oriented is None:
+            found.append(_fitted(nominal, benchmark, prior, apriori, pose, reaches_px, features_of, from_map))
+        except GateError as fault:
+            trouble = trouble or fault
+            continue
+        if found[-1].support > USUAL_SHARE and found[-1].residual_rms_px < USUAL_RMS_PX:
+            return found[-1]
+    if not found:
         assert trouble is not None
         raise trouble
-    return oriented
+    return max(found, key=lambda one: one.support / one.residual_rms_px)
+
+
+def _starts(
+    nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray,
+    features_of: Callable[[VirtualCamera], ImageFeatures],
+) -> Iterator[tuple[FloatArray, tuple[int, ...], bool]]:  # fmt: skip
+    """Poses to start from, the reaches of each, and whether it is the feature map's; each is made when asked for."""
+    yield np.zeros(_POSES), _REACHES_PX, False
+    yield np.zeros(_POSES), _REACHES_PX[1:], False
+    pose = _pose_of_feature_map(nominal, benchmark.image, prior, features_of(nominal))
+    if pose is not None:
+        yield pose, _REACHES_PX[1:], True
 
 
 def _turn_seen(nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd) -> str:
@@ -313,11 +321,14 @@ def with_deflected_benchmark(oriented: OrientedCamera, theta_rad: float, plane_l
 
 def _fitted(
     nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd, pose: FloatArray,
-    reaches_px: tuple[int, ...], features_of: Callable[[VirtualCamera], ImageFeatures],
+    reaches_px: tuple[int, ...], features_of: Callable[[VirtualCamera], ImageFeatures], from_map: bool = False,
 ) -> OrientedCamera:  # fmt: skip
-    """Fit the pose from a start, features looked for within each reach; refused where the edge is not the shell's."""
+    """Fit the pose from a start, features looked for within each reach; refused where the edge is not the shell's.
+
+    Where the start is ``from_map``, first by the features alone, as the edge may be farther off.
+    """
     for number, reach in enumerate(reaches_px):
-        alone = number == 0 and bool(reach)  # from the map: what was found there first, the edge then
+        alone = number == 0 and from_map
         features = features_of(_posed(nominal, pose))
         sd = np.append(prior, max(features.offset_px, 1e-6))
         for _ in range(_STEPS):
