@@ -59,7 +59,7 @@ _NOT_THE_SHELL = (
 # (over so many frames that they are not the benchmark's neighbours alone)
 _PAINTED, _LEAST_PAINTED = 0.25, 3
 # frames with two edges, and of all: of thirty films of two pictures mixed 17 % and more, but for two that are refused
-# otherwise; of sound ones 7 % at the most, where the Earth's limb lies along the rim, at each turn of the vehicle
+# otherwise; of eighty sound ones 7 % at the most, one at 0.5 rpm 18 %, where the Earth's limb lies along the rim
 _LEAST_MIXED, _MIXED = 2, 0.15
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _EDGE_FOR_PLANE = 0.5  # of the edge in the benchmark frame: a frame needs half as much, found in both

@@ -51,6 +51,16 @@ def shell(features):
     return GEOMETRY.model_copy(update={"features": features})
 
 
+def test_a_benchmark_frame_in_the_shade_before_the_earth_orients_the_camera():
+    """The shell is hardly brighter than the Earth behind it, whose limb passes for the edge from far."""
+    folder = FRAMES.parent / "shaded_benchmark"
+    frames = [cv2.imread(str(folder / f"shade_{t}.jpg"), cv2.IMREAD_GRAYSCALE) for t in (421, 439)]
+    history = read_film(np.array([421.0, 439.0]), frames, shell("texture"), MOUNT, JOINT_M, plane_lv_rad=None).history()
+    error = np.rad2deg(history.theta_rad[1]) - 1.4739
+    assert abs(error) < 0.15
+    assert abs(error) < 3.0 * np.rad2deg(history.theta_sd_rad[1])
+
+
 @pytest.mark.parametrize("look", ["clean", "flown"])
 @pytest.mark.parametrize("stated", ["texture", "drawn"])
 def test_another_paint_is_read_by_its_texture_whatever_the_vehicle_file_states(look, stated):
