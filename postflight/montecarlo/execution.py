@@ -14,7 +14,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import pickle
 import signal
 import threading
 from collections import Counter
@@ -23,12 +22,11 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import version
 from itertools import islice
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -106,39 +104,21 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-@cache
-def _kept_study(path: str) -> Study:
-    study: Study = pickle.loads(Path(path).read_bytes())
-    return study
-
-
-def _fly_kept(path: str, job: Job) -> Done:
-    return fly_chunk(_kept_study(path), job)
-
-
 def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]:
-    with TemporaryDirectory(prefix="postflight-") as folder:
-        # in a file: at the start, or with every job, it would fill the pipe, and a pool whose workers end while it
-        # writes to a full one may never end (CPython's issue 94777)
-        kept = Path(folder) / "study.pickle"
-        kept.write_bytes(pickle.dumps(study))
-        yield from _from_file(str(kept), jobs, workers)
-
-
-def _from_file(path: str, jobs: list[Job], workers: int) -> Iterator[Done]:
     ahead = iter(jobs)
     # spawned, not forked: a fork copies locks that threads of this process may hold
     context = multiprocessing.get_context("spawn")
+    # the study goes with every job: given at the start, it would fill the pipe and let workers start one by one
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     begun = multiprocessing.active_children()
     try:
         with _one_thread_each():
-            waiting: set[Future[Done]] = {pool.submit(_fly_kept, path, job) for job in islice(ahead, AHEAD * workers)}
+            waiting: set[Future[Done]] = {pool.submit(fly_chunk, study, job) for job in islice(ahead, AHEAD * workers)}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-                waiting |= {pool.submit(_fly_kept, path, job) for job in islice(ahead, 1)}
+                waiting |= {pool.submit(fly_chunk, study, job) for job in islice(ahead, 1)}
     except BrokenProcessPool:
         raise GateError(
             "a worker process was killed (out of memory?); every finished chunk is kept: the same command resumes from "
@@ -149,6 +129,8 @@ def _from_file(path: str, jobs: list[Job], workers: int) -> Iterator[Done]:
         for process in multiprocessing.active_children():
             if process not in begun:
                 process.terminate()
+        # a pipe full of jobs that nobody reads any more would hold the pool's thread for ever (CPython's issue 94777)
+        pool._call_queue._reader.close()  # type: ignore[attr-defined]
         # waits for the pool's own thread too: one that still ends while Python does closes a pipe that Python writes to
         pool.shutdown(cancel_futures=True)
 
