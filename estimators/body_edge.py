@@ -69,7 +69,7 @@ class MountMotion:
         return np.asarray(across @ self.shift_px + self.turn_rad * (across[:, 1] * u - across[:, 0] * v))
 
 
-UNMOVED = MountMotion(0.0, True)
+UNMOVED, UNSEEN = MountMotion(0.0, True), MountMotion(float("nan"), False)
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class BodyEdge:
         seen = clear & np.isfinite(moved)
         moved = moved[seen]
         if len(moved) < _LEAST_POINTS:
-            return MountMotion(float("nan"), False)
+            return UNSEEN
         same = np.count_nonzero(np.abs(moved) < _SAME_PX) / len(moved)
         if same >= _MOST_SAME:
             return UNMOVED
@@ -166,4 +166,4 @@ def _followed(places_px: FloatArray, out: FloatArray, moved_px: FloatArray) -> M
     for scale in _TOWARDS_PX:
         weight = 1.0 / (1.0 + ((moved_px - by @ motion) / scale) ** 2)
         motion = np.asarray(np.linalg.lstsq(by * weight[:, None], moved_px * weight, rcond=None)[0], dtype=float)
-    return MountMotion(float("nan"), False, about, motion[:2], float(motion[2]) / longest)
+    return replace(UNSEEN, about_px=about, shift_px=motion[:2], turn_rad=float(motion[2]) / longest)

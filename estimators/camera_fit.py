@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.body_edge import UNMOVED, MountMotion
+from estimators.body_edge import UNMOVED, UNSEEN, MountMotion
 from estimators.edge import (
     NO_FAULT,
     HorizonLine,
@@ -289,7 +289,7 @@ class OrientedCamera(FrameModel):
 
     def _mount(self, frame: EditedFrame) -> MountMotion:
         if self.body is None:
-            return MountMotion(float("nan"), False)
+            return UNSEEN
         return self.body.moved(frame.kept, frame.is_clear(self.body.lines.origin_px))
 
     def points_at(

@@ -416,7 +416,9 @@ def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
         )
         # a small window's own energy changes as it is shifted, which moves a parabola's top by a tenth of a pixel
         np.testing.assert_allclose(place[0], np.array([32.0, 29.0]) + off, atol=0.15)
-        assert (sd < 0.4).all()
+        # across the rows their means, which are left out, say nothing
+        assert sd[0, 0] < 0.3
+        assert sd[0, 1] < 0.4
 
 
 def test_a_dark_line_is_found_where_it_is_with_the_sd_its_noise_gives():
