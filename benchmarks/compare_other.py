@@ -113,7 +113,7 @@ def main():
         for team, trajectory in teams.items():
             for what in PLANTS:
                 other = planted(other_team(trajectory), what, np.random.default_rng([seed, 3]))
-                found = systematic_differences(bet, bet.time_s[::EVERY], bet.covariance[::EVERY], True, other)
+                found = systematic_differences(bet, bet.time_s[::EVERY], bet.covariance[::EVERY], other)
                 names = [effect.name for effect in found.effects if effect.beyond or team == "export"]
                 named[team, what] += what in names
                 false[team, what] += bool(set(names) - {what, *(("shift",) if what == "height-datum" else ())})

@@ -384,7 +384,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
     Light and shade on plain cloth agree now and then, and move as the Sun does; the edge alone counts then. Where more
     agrees than ever does of light and shade, the texture is the shell's, and frames without show something else.
     """
-    answered = np.array([not fit.refused for fit in fits]) & (time_s != benchmark_s)
+    answered = np.array([not fit.refused for fit in fits], dtype=bool) & (time_s != benchmark_s)
     agreed = np.array([fit.features for fit in fits])
     with_texture = (agreed > 0) & answered
     if not answered.any() or with_texture.sum() >= _MOST * answered.sum():

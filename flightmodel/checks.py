@@ -124,9 +124,9 @@ def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> 
     return out
 
 
-def check_finite(name: str, array: FloatArray) -> None:
-    """Raise `GateError` naming the first entry that is NaN or infinite."""
-    bad = ~np.isfinite(array)
+def check_finite(name: str, array: FloatArray, or_missing: bool = False) -> None:
+    """Raise `GateError` naming the first entry that is NaN or infinite; with ``or_missing`` NaN is a missing value."""
+    bad = np.isinf(array) if or_missing else ~np.isfinite(array)
     if bad.any():
         first = tuple(int(i) for i in np.argwhere(bad)[0])
         raise GateError(

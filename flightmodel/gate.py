@@ -35,6 +35,7 @@ from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import Source, ThinnedSpan, spaced, spacing_s
 from flightmodel.telemetry import Finding
 
+MOST_PAUSE_S = 86400.0  # no vehicle is in flight, or on its pad, for a day without a reading
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
 SANE_LIMIT = {
     "acceleration": 1.0e4,
@@ -163,6 +164,7 @@ class Gate:
         table = self.chosen(table, source)
         if not len(table.lines):
             return None
+        self._refuse_far_times(table)
         for quantity in quantities:
             limit = SANE_LIMIT.get(quantity.kind, np.inf)
             self.refuse_rows(table, quantity.short, -limit, limit, f"beyond any {quantity.kind} of a flight")
@@ -240,6 +242,19 @@ class Gate:
         rows = delivery.rows
         held = {short: column[rows] for short, column in table.columns.items()}
         return Table(table.path, table.label, table.time_s[rows], held, table.lines[rows])
+
+    def _refuse_far_times(self, table: Table) -> None:
+        """Refuse a table with a time that lies days from the rows beside it: all in between would be reconstructed."""
+        if table.time_s is None or len(table.time_s) < 2:
+            return
+        k = int(np.argmax(np.diff(table.time_s)))
+        before, after = table.time_s[k : k + 2]
+        if after - before > MOST_PAUSE_S:
+            self.refuse(
+                f"{table.at(k + 1)}: time {after:.6g} s follows {before:.6g} s, a pause of {after - before:.3g} s; "
+                f"correct or remove the row, or choose a span with use_s; at most {MOST_PAUSE_S:g} s are bridged",
+                "time-far",
+            )
 
     def refuse_rows(self, table: Table, short: str, low: float, high: float | FloatArray, words: str) -> None:
         """Refuse a column's values outside ``low`` to ``high`` (SI), naming the first's line; missing ones pass."""

@@ -472,7 +472,9 @@ def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
     """Column and unit in which a table holds a quantity."""
     if declared is not None:
         return declared.column, declared.unit
-    return quantity.canonical, quantity.canonical.rsplit("_", 1)[-1]
+    unit = quantity.canonical.rsplit("_", 1)[-1]
+    pure = quantity.kind == "fraction" and read_unit(unit) is None  # the names of pure numbers end in no unit
+    return quantity.canonical, "1" if pure else unit
 
 
 def fits(quantity: Quantity, unit: str) -> bool:

@@ -42,8 +42,9 @@ class Trajectory(Tabular):
     velocity_ecef_mps : (n, 3) float
         Relative to the rotating Earth.
     q_ecef_body : (n, 4) float
+        NaN where no sensor gives an attitude.
     omega_body_eci_body_radps : (n, 3) float
-        Rate of the body relative to inertial space, body axes.
+        Rate of the body relative to inertial space, body axes; NaN where it is not measured, as in a gap of the gyros.
     covariance : (n, 9, 9) float or None
         Of position ECEF m, velocity ECEF m/s, rotation in body axes rad: the coordinates of `difference`.
     planet : Planet
@@ -62,13 +63,13 @@ class Trajectory(Tabular):
     def __post_init__(self) -> None:
         """Check shapes, finiteness, time order and unit attitudes once."""
         n = len(self.time_s)
-        for name, width in (
-            ("position_ecef_m", 3),
-            ("velocity_ecef_mps", 3),
-            ("q_ecef_body", 4),
-            ("omega_body_eci_body_radps", 3),
+        for name, width, or_missing in (
+            ("position_ecef_m", 3, False),
+            ("velocity_ecef_mps", 3, False),
+            ("q_ecef_body", 4, True),
+            ("omega_body_eci_body_radps", 3, True),
         ):
-            check_finite(name, check_shape(name, getattr(self, name), (n, width)))
+            check_finite(name, check_shape(name, getattr(self, name), (n, width)), or_missing)
         check_increasing("trajectory.time_s", self.time_s)
         check_unit_quaternion("q_ecef_body", self.q_ecef_body)
         if self.covariance is not None:

@@ -168,7 +168,7 @@ def run(
 
     _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages)
     print_increments(answers)
-    if reruns:
+    if (written / "sensitivity.csv").is_file():
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
     console.print(f"results in {escape(str(written))}, to read in report.html")
     if any(reason.code != NO_VIDEO for reason in answers.refused.values()):
@@ -217,23 +217,29 @@ def run_flight(
             second.draw_deflections(answers)  # not sooner: to hand them over takes a moment
             with progress_bar() as report:
                 step = steps(report)
-                answers = with_increments(answers)
+                run_folder.write_reconstruction(out, bet, answers)
+                run_folder.write_answers(out, answers)
+                out.keep(run_folder.summary(bet, answers, event_rows))
+                stages.end("tables")
+                with out.part("aerodynamic increments"):
+                    answers = with_increments(answers)
+                    run_folder.write_increments(out, answers)
+                    run_folder.write_all_checks(out, bet, answers)
                 stages.end("aerodynamic increments")
                 bounds, reran = _write_rest(out, bet, answers, reruns, step)
                 second.draw_studies(bounds, reran, answers.increments)
                 stages.end("bounds of the rigid vehicle")
-                run_folder.write_reconstruction(out, bet, answers)
-                run_folder.write_answers(out, answers)
-                out.write_json("summary.json", run_folder.summary(bet, answers, event_rows))
-                stages.end("tables")
                 step(0.9, 1.0)(0.0, "drawing, and writing the report")
                 lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
                 (out.path / "log.jsonl").write_text(lines)
-                out.write_facts()
-                write_report(folder, out.path, flight.telemetry)
+                out.keep(run_folder.summary(bet, answers, event_rows))
+                with out.part("report"):
+                    write_report(folder, out.path, flight.telemetry)
                 stages.end("report")
                 second.finish()
                 stages.end("figures that were not drawn meanwhile")
+    for reason in out.left_out:
+        console.coded("[yellow]left out[/]", reason, reason.code)
     return bet, answers, out.path
 
 
@@ -268,15 +274,18 @@ def _write_rest(
     step: Callable[[float, float], Progress],
 ) -> tuple[Bounds | None, pd.DataFrame | None]:  # fmt: skip
     """Write what comes after the answers; return the rigid vehicle's bounds and the sensitivity, for the figures."""
-    if "camera" in answers.histories:
-        out.write_csv("camera_sensitivity.csv", camera_sensitivity(bet.flight, answers.histories["camera"]))
     bounds, table = None, None
+    if "camera" in answers.histories:
+        with out.part("camera sensitivity"):
+            out.write_csv("camera_sensitivity.csv", camera_sensitivity(bet.flight, answers.histories["camera"]))
     if bet.loads is not None:
-        bounds = entry_bounds(bet, None, progress=step(0.1, 0.2 if reruns else 0.9))
-        out.write_csv("rigid_bounds.csv", bounds.table())
+        with out.part("bounds of the rigid vehicle"):
+            bounds = entry_bounds(bet, None, progress=step(0.1, 0.2 if reruns else 0.9))
+            out.write_csv("rigid_bounds.csv", bounds.table())
     if reruns:
-        table = sensitivity(bet, step(0.2, 0.9))
-        out.write_csv("sensitivity.csv", table)
+        with out.part("sensitivity"):
+            table = sensitivity(bet, step(0.2, 0.9))
+            out.write_csv("sensitivity.csv", table)
     return bounds, table
 
 
@@ -550,12 +559,15 @@ def print_score(result: Score) -> None:
         table.add_row(method, *numbers, f"{row['error_deg']:+.2f}", *beside)
     console.print(table)
     bet = result.bet
-    console.print(
-        f"BET over the pulse ({bet['pulse_start_s']:.1f} to {bet['pulse_end_s']:.1f} s), rms error (1 sd as stated): "
-        f"position {bet['position_rms_m']:.1f} ({bet['position_sd_m']:.1f}) m, "
-        f"velocity {bet['velocity_rms_mps']:.2f} ({bet['velocity_sd_mps']:.2f}) m/s, "
+    parts = [
+        f"position {bet['position_rms_m']:.1f} ({bet['position_sd_m']:.1f}) m",
+        f"velocity {bet['velocity_rms_mps']:.2f} ({bet['velocity_sd_mps']:.2f}) m/s",
         f"total angle of attack {bet['alpha_total_rms_deg']:.2f} ({bet['alpha_total_sd_deg']:.2f}) deg"
-    )
+        if np.isfinite(bet["alpha_total_sd_deg"])
+        else "no attitude was estimated",
+    ]
+    span = f"{bet['pulse_start_s']:.1f} to {bet['pulse_end_s']:.1f} s"
+    console.print(f"BET over the pulse ({span}), rms error (1 sd as stated): {', '.join(parts)}")
     for failure in result.failures:
         console.coded("[red]failed[/]", failure, failure.code)
     if not result.failures:

@@ -31,7 +31,11 @@ Sd = TypeVar("Sd", float, pd.Series)
 MOST_RUNS = 6  # that strokes and colours keep apart
 INDEPENDENT, CORRELATED = "independent", "correlated"
 # quantity, its unit, its column in bet.csv and that of its sd
-_APART = (("position_m", slice(0, 3), 1.0), ("velocity_mps", slice(3, 6), 1.0), ("attitude_deg", slice(6, 9), None))
+_APART = (
+    ("position_m", slice(0, 3), 1.0),
+    ("velocity_mps", slice(3, 6), 1.0),
+    ("attitude_deg", slice(6, 9), 180.0 / np.pi),
+)
 
 
 @dataclass(frozen=True)
@@ -274,17 +278,6 @@ def _angle_deg(history: DeflectionHistory, time_s: FloatArray) -> FloatArray:
 
 def _vectors(a: pd.DataFrame, b: pd.DataFrame) -> dict[str, FloatArray]:
     """Sizes of the differences of position, velocity and attitude; NaN where one has no attitude."""
-    has_attitude = all(table["qw_ecef_body"].notna().all() for table in (a, b))
-    paths = [trajectory_of(table if has_attitude else upright(table)) for table in (a, b)]
-    gap = difference(resample(paths[1], paths[0].time_s), paths[0])
-    out = {}
-    for name, part, scale in _APART:
-        size = np.linalg.norm(gap[:, part], axis=1) * (180.0 / np.pi if scale is None else scale)
-        out[name] = size if has_attitude or scale is not None else np.full(len(size), np.nan)
-    return out
-
-
-def upright(table: pd.DataFrame) -> pd.DataFrame:
-    """Table with a placeholder where the attitude is not known, which positions and velocities do not feel."""
-    blank = {f"q{a}_ecef_body": float(a == "w") for a in "wxyz"} | {f"{a}_body_degps": 0.0 for a in "pqr"}
-    return table.assign(**blank)
+    first, other = trajectory_of(a), trajectory_of(b)
+    gap = difference(resample(other, first.time_s), first)
+    return {name: np.linalg.norm(gap[:, part], axis=1) * scale for name, part, scale in _APART}

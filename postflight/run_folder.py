@@ -19,7 +19,7 @@ import json
 import platform
 import re
 import shutil
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -31,10 +31,10 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import events
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError
 from flightmodel.deflection import mean_over
 from flightmodel.earth import WGS84, name_of
-from flightmodel.files import abandoned, open_file, partial_path, write_file, writing
+from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Finding, Telemetry
 from postflight.deflections import Deflections, no_answer_at, quantiles_at
@@ -95,6 +95,7 @@ class RunFolder:
         self.name = name
         self.as_read = as_read
         self.finished: datetime | None = None
+        self.left_out: list[Fault] = []
         self.settings = settings
         self.telemetry = telemetry
         self.parent = flight_folder / "runs"
@@ -113,22 +114,36 @@ class RunFolder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
-        """Rename when whole; remove otherwise, also where the end itself is interrupted."""
-        partial = self.path
+        """Rename when whole or when answers are kept; remove otherwise, also where the end itself is interrupted."""
+        partial, kept = self.path, self.finished is not None
         try:
             with writing(self.parent, _COPY):
+                if kind is None or kept:
+                    self._finish()
                 if isinstance(fault, OSError):
                     raise fault
-                if kind is None:
-                    self._finish()
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-            if kind is not None:
+            if kind is not None and not kept:
                 with contextlib.suppress(OSError):  # of other runs
                     self.parent.rmdir()
 
+    def keep(self, summary: dict[str, Any]) -> None:
+        """Write the summary and ``run.json``: from here on the folder stays, whatever ends the command."""
+        missing = [*summary.get("missing", ()), *self.left_out]
+        self.write_json("summary.json", summary | {"missing": missing})
+        self.write_facts()
+
+    @contextlib.contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Run what no answer depends on; if it is refused, say so in `left_out` and go on."""
+        try:
+            yield
+        except (GateError, DivergenceError) as fault:
+            self.left_out.append(Fault(f"{name}: {fault}", fault.codes[0]))
+
     def write_facts(self) -> datetime:
-        """Write ``run.json`` and return the run's time: at the end, or earlier for what reads it (the report)."""
+        """Write ``run.json`` and return the run's time."""
         now = datetime.now(UTC)
         facts = {
             **({"name": self.name} if self.name else {}),
@@ -145,6 +160,8 @@ class RunFolder:
 
     def _finish(self) -> None:
         now = self.finished or self.write_facts()
+        for half in self.path.rglob(f".{PARTIAL}-*"):  # of a process that was stopped
+            half.unlink(missing_ok=True)
         label = f"-{self.name}" if self.name else ""
         final = self.parent / f"{now.strftime('%Y%m%dT%H%M%SZ')}-{self.hash8}{label}"
         for _ in range(_ATTEMPTS):
@@ -279,13 +296,7 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
     run.write_csv("residuals.csv", _residuals(bet.residuals))
     if len(bet.held_out):
         run.write_csv("withheld.csv", _residuals(bet.held_out))
-    of_deflection = () if answers is None else answers.consistency_checks
-    checks = write_checks(run, (*flight.consistency_checks, *of_deflection))
-    # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
-    run.write_csv(
-        "verdicts.csv",
-        checks.drop(columns=["code", "source", "component", "symptom"]).rename(columns={"remark": "words"}),
-    )
+    write_all_checks(run, flight, answers)
     run.write_csv("sensor_errors.csv", in_degrees(bet.sensor_errors, "prior_sd", "estimate", "sd"))
     event_rows = event_table(flight, table)
     run.write_csv("events.csv", event_rows)
@@ -310,6 +321,17 @@ def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
     return (Finding("attitude", words, np.nan, np.nan, "attitude-missing"),)
 
 
+def write_all_checks(run: RunFolder, flight: Reconstruction, answers: Deflections | None) -> None:
+    """Write the checks of a trajectory and its deflections, also as version 0.1 named them."""
+    of_deflection = () if answers is None else answers.consistency_checks
+    checks = write_checks(run, (*flight.consistency_checks, *of_deflection))
+    # the table's name and columns of version 0.1, for scripts that read it; to go with version 0.3
+    run.write_csv(
+        "verdicts.csv",
+        checks.drop(columns=["code", "source", "component", "symptom"]).rename(columns={"remark": "words"}),
+    )
+
+
 def write_checks(run: RunFolder, checks: Iterable[ConsistencyCheck]) -> pd.DataFrame:
     """Write ``consistency_checks.csv``, and return it."""
     table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(ConsistencyCheck)])
@@ -332,6 +354,10 @@ def write_answers(run: RunFolder, answers: Deflections) -> None:
     if answers.fused is not None:
         run.write_csv("fusion_inputs.csv", answers.fused.input_frame())
         run.write_csv("fusion_agreement.csv", answers.fused.agreement_frame())
+
+
+def write_increments(run: RunFolder, answers: Deflections) -> None:
+    """Write the tables of the aerodynamic increments, where there are any."""
     if answers.increments is not None:
         run.write_csv("aero_increments.csv", answers.increments.to_frame())
         run.write_csv("aero_increments_correlations.csv", answers.increments.correlations())

@@ -1,7 +1,8 @@
 """How large are a run's errors? A finished run of a synthetic flight against its truth.
 
 The only place that opens ``truth/``. Deflections are compared at the true peak of dynamic pressure; the trajectory by
-root-mean-square errors ``sqrt(mean |estimate - truth|^2)`` over the pressure pulse. An error is too large beyond four
+root-mean-square errors ``sqrt(mean |estimate - truth|^2)`` over those rows of the pressure pulse that have a value: a
+gap of the gyros has no rates, and a flight without inertial sensors no attitude. An error is too large beyond four
 of the run's own standard deviations (of the trajectory their root-mean-square over the pulse), so that a limit fits any
 vehicle, flight and instrument. How small the standard deviations are is printed beside them.
 """
@@ -62,7 +63,7 @@ class Score(Tabular):
         return {
             "peak_dynamic_pressure_s": self.peak_s,
             "methods": self.methods,
-            "bet": self.bet,
+            "bet": {name: value if np.isfinite(value) else None for name, value in self.bet.items()},
             "passed": not self.failures,
             "failures": list(self.failures),
         }
@@ -102,7 +103,7 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     failures += [
         Fault(f"BET {name}: {bet[name]:.3f} beyond {LIMIT_SD:g} sd of {bet[_sd(name)]:.3f}", "trajectory-error")
         for name in BET_SD
-        if not bet[name] <= LIMIT_SD * bet[_sd(name)]
+        if np.isfinite(bet[_sd(name)]) and not bet[name] <= LIMIT_SD * bet[_sd(name)]
     ]
     vehicle = read_back(run / "bet_header.json").get("vehicle")
     return Score(peak_s, methods, bet, tuple(failures), "" if vehicle is None else vehicle["name"])
@@ -152,7 +153,9 @@ def _bet_errors(bet: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
     alpha_error = bet["alpha_total_wind_deg"].to_numpy() - along("alpha_body_deg")
 
     def rms(values: FloatArray) -> float:
-        return float(np.sqrt(np.mean(np.sum(np.atleast_2d(values.T) ** 2, axis=0)[pulse])))
+        squares = np.sum(np.atleast_2d(values.T) ** 2, axis=0)[pulse]
+        known = squares[np.isfinite(squares)]
+        return float(np.sqrt(known.mean())) if len(known) else np.nan
 
     stated = {_sd(name): rms(bet[list(columns)].to_numpy()) for name, columns in BET_SD.items()}
     return stated | {

@@ -53,7 +53,7 @@ Silvey, Titterington, Torsney, "An algorithm for optimal designs on a finite des
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -255,18 +255,17 @@ def _short(value: float) -> str:
 
 
 def systematic_differences(
-    run: Trajectory, covariance_time_s: FloatArray, covariance: FloatArray, has_attitude: bool, other: OtherTrajectory
+    run: Trajectory, covariance_time_s: FloatArray, covariance: FloatArray, other: OtherTrajectory
 ) -> SystematicDifferences:
     """Find what separates another source's trajectory from the run's.
 
     Parameters
     ----------
     run : Trajectory
+        Its attitude may be missing. Rates missing in a gap are interpolated, since only a lever arm needs them.
     covariance_time_s : (k,) float
     covariance : (k, 9, 9) float
         Of the run, in the coordinates of `flightmodel.trajectory.difference`.
-    has_attitude : bool
-        Whether the run's attitude is known.
     other : OtherTrajectory
 
     Raises
@@ -275,16 +274,26 @@ def systematic_differences(
         ``no-common-time`` where fewer than 20 of the other's epochs lie in the run.
     """
     best: _Explained | None = None
+    run = _with_rates(run)
     stated = covariance_time_s, covariance
     starts = [s for s in (0.0, *_far_offset(run, other)) if _covered(run, other.time_s, s).sum() >= _LEAST_EPOCHS]
     for start_s in starts or [0.0]:
-        explained = _Fit(run, stated, other, has_attitude, start_s).explained()
+        explained = _Fit(run, stated, other, start_s).explained()
         if best is None or explained.score > best.score:
             best = explained
     assert best is not None
     if np.abs(best.fit.undulation_m).min() > _LEAST_UNDULATION_M:
-        best = _with_datum(best, _Fit(run, stated, other, has_attitude, best.fit.start_s, datum=True))
+        best = _with_datum(best, _Fit(run, stated, other, best.fit.start_s, datum=True))
     return _result(best)
+
+
+def _with_rates(run: Trajectory) -> Trajectory:
+    """Trajectory with missing rates interpolated between those that were measured; as it is where none was."""
+    known = np.isfinite(run.omega_body_eci_body_radps).all(axis=1)
+    if known.all() or not known.any():
+        return run
+    rates = interpolate_rows(run.time_s, run.time_s[known], run.omega_body_eci_body_radps[known])
+    return replace(run, omega_body_eci_body_radps=rates)
 
 
 def _with_datum(best: _Explained, datum: _Fit) -> _Explained:
@@ -336,7 +345,6 @@ class _Fit:
         run: Trajectory,
         stated: tuple[FloatArray, FloatArray],
         other: OtherTrajectory,
-        has_attitude: bool,
         start_s: float,
         datum: bool = False,
     ) -> None:
@@ -347,6 +355,7 @@ class _Fit:
         use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), _MOST_EPOCHS)).astype(int))]
         self.run, self.stated, self.other, self.use, self.start_s, self.datum = run, stated, other, use, start_s, datum
         self.time_s = other.time_s[use]
+        has_attitude = bool(np.isfinite(run.q_ecef_body).all())
         known = {
             "position": True,
             "velocity": other.velocity_ecef_mps is not None,
@@ -693,7 +702,7 @@ def _result(best: _Explained) -> SystematicDifferences:
         effects.append(FoundEffect(name, components, *values, unit, allowed.size))
     none = np.zeros(fit.count)
     none[fit.slices["time-offset"]] = -fit.start_s
-    plain = _Fit(fit.run, fit.stated, other, "attitude" in fit.groups, fit.start_s)
+    plain = _Fit(fit.run, fit.stated, other, fit.start_s)
     given = plain.difference(none if _covered(fit.run, fit.time_s, 0.0).all() else np.zeros(fit.count))
     chi_square = {}
     for group in ("all", *fit.groups):

@@ -210,10 +210,16 @@ def _growth(z: FloatArray) -> FloatArray:
 RESOLVED_PHASE_RAD = 0.4
 
 
+def resolving_step_s(vehicle: Vehicle) -> float:
+    """Longest step that resolves the joint's bending oscillation, s."""
+    inertia, _, stiffness = joint_modes(vehicle)["bending"]
+    return float(RESOLVED_PHASE_RAD * np.sqrt(inertia / stiffness))
+
+
 def check_resolved(vehicle: Vehicle, step_s: float) -> None:
     """Refuse a step that blurs the joint's oscillation; `ConfigError` says the longest that does not."""
     inertia, _, stiffness = joint_modes(vehicle)["bending"]
-    longest = RESOLVED_PHASE_RAD * np.sqrt(inertia / stiffness)
+    longest = resolving_step_s(vehicle)
     if step_s > longest:
         raise ConfigError(
             f"step of {1e3 * step_s:.3g} ms is too long for a bending mode of "

@@ -107,7 +107,8 @@ def fly_ensemble(
             code="ensemble-arguments",
         )
     check_mass(vehicle)
-    check_step(vehicle, schedule.step_s)
+    if schedule.frees_joint:
+        check_step(vehicle, schedule.step_s)
     remaining = iter(runs)
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[tuple[list[int], Future[list[Flown]]]] = deque()

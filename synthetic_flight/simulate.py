@@ -175,6 +175,11 @@ class Schedule:
     records: int
     lock_records: int = 0
 
+    @property
+    def frees_joint(self) -> bool:
+        """Whether the joint deflects in any of the steps."""
+        return self.lock_records < self.records
+
 
 def state_from_ecef(
     time_s: float,

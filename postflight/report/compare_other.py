@@ -14,7 +14,6 @@ from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import require_earth
 from flightmodel.files import open_file
-from postflight.comparison import upright
 from postflight.intake.other_trajectory import read_other
 from postflight.plots.style import COLOUR, PAGE
 from postflight.report.panels import Panel, line_of, panel_of
@@ -42,10 +41,8 @@ def compare_with_other(run: RunTables, path: Path) -> tuple[SystematicDifference
     bet = run.tables["bet"]
     epoch = run.header["epoch_utc"]
     require_earth(run.header.get("planet", "earth"), "a comparison with another source's file")
-    has_attitude = bool(bet["qw_ecef_body"].notna().all())
-    trajectory = trajectory_of(bet if has_attitude else upright(bet), epoch)
     times, covariance = _covariance(run)
-    found = systematic_differences(trajectory, times, covariance, has_attitude, read_other(path, epoch))
+    found = systematic_differences(trajectory_of(bet, epoch), times, covariance, read_other(path, epoch))
     tables = dict(zip(OTHER_TABLES, (found.to_frame(), _chi_square(found), found.histories()), strict=True))
     return found, tables, _page(run, found, tables)
 

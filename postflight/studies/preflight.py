@@ -45,7 +45,7 @@ from synthetic_flight.dispersions import (
     draws,
     rng_from_draw,
 )
-from synthetic_flight.dynamics import check_step
+from synthetic_flight.dynamics import check_step, resolving_step_s
 from synthetic_flight.ensemble import LANES, Flown, Records, Start, fly_ensemble
 from synthetic_flight.simulate import Schedule, state_from_ecef
 from synthetic_flight.weather import correlated
@@ -178,7 +178,7 @@ class _Entry:
         self.profile = profile_from_sounding(flight.telemetry.sounding)
         self.at_start = resample(flight.solution.smoothed, np.array([self.start_s]))
         turning_radps = fastest_radps(vehicle, flight.solution, air)
-        steps = round(RECORD_S / (RIGID_STEP_S if self.locked else FLEXIBLE_STEP_S))
+        steps = round(RECORD_S / (RIGID_STEP_S if self.locked else min(FLEXIBLE_STEP_S, resolving_step_s(vehicle))))
         steps = max(steps, int(np.ceil(RECORD_S * turning_radps / STEP_RAD)))
         self.schedule = Schedule(RECORD_S / steps, steps, self.records, self.records if self.locked else 0)
 

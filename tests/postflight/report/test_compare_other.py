@@ -60,7 +60,7 @@ def other(run):
 
 def found(run, other):
     path, times, covariance = run
-    return systematic_differences(path, times, covariance, True, other)
+    return systematic_differences(path, times, covariance, other)
 
 
 WAY = np.array([2.0, -1.0, 2.0]) / 3.0
@@ -153,7 +153,7 @@ def test_chi_square_is_the_differences_own(run, other):
     mine = np.tile(np.diag([4.0] * 3 + [0.04] * 3 + [1e-4] * 3), (len(times), 1, 1))
     theirs = np.tile(np.diag([5.0] * 3 + [0.05] * 3), (2, 1, 1))
     stated = replace(shifted(other), covariance_time_s=path.time_s[[0, -1]], covariance=theirs)
-    result = systematic_differences(path, times, mine, True, stated)
+    result = systematic_differences(path, times, mine, stated)
     table = result.histories()
     given = table[[f"position_{a}_m" for a in ("north", "east", "down")]].to_numpy()
     assert result.chi_square["position"][0] == pytest.approx((given**2 / 9.0).sum(axis=1).mean() / 3.0, rel=1e-3)
@@ -231,7 +231,7 @@ def test_errors_of_any_correlation_in_time_stay_within_what_is_allowed(run, othe
         q_ecef_body=other.q_ecef_body[few],
     )
     mine, theirs = two_teams(run, thin, np.zeros((60, 9)))
-    fit = differences._Fit(mine[0], mine[1:], theirs, True, 0.0)
+    fit = differences._Fit(mine[0], mine[1:], theirs, 0.0)
     solved, epochs = fit.solved(SEEN), len(fit.time_s)
     rng = np.random.default_rng(3)
     draws = 150
