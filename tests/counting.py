@@ -1,8 +1,8 @@
 """What the budget counts of each package: lines of code, files, constants at module level, codes of messages.
 
-A *line of code* holds a token other than a comment, a docstring or an import. A *constant* is a name in capitals that a
-module binds to an expression with a number in it. A *code* is a stable code of a message (``docs/message_codes.py``); it
-belongs to the first package, in the order of `PACKAGES`, that uses it.
+A *line of code* holds a token other than a comment, a docstring or an import. A *constant* is a name in capitals that
+a module binds to an expression with a number in it. A *code* is a stable code of a message
+(``docs/message_codes.py``); it belongs to the first package, in the order of `PACKAGES`, that uses it.
 
 ``python -m tests.counting`` prints the counts beside ``budget.toml``.
 """
@@ -94,11 +94,12 @@ def budget() -> dict[str, dict[str, int]]:
 def main() -> None:
     """Print counts and budget."""
     found, allowed = counted(), budget()
-    print(f"{'':18}" + "".join(f"{kind:>22}" for kind in KINDS))
-    for package in PACKAGES:
-        print(f"{package:18}" + "".join(f"{found[package][k]:>12} of {allowed[package][k]:>6}" for k in KINDS))
-    total = {k: (sum(f[k] for f in found.values()), sum(a[k] for a in allowed.values())) for k in KINDS}
-    print(f"{'all':18}" + "".join(f"{total[k][0]:>12} of {total[k][1]:>6}" for k in KINDS))
+    for counts in (found, allowed):
+        counts["all"] = {kind: sum(of[kind] for of in counts.values()) for kind in KINDS}
+    rows = [f"{'':18}" + "".join(f"{kind:>22}" for kind in KINDS)]
+    for name in (*PACKAGES, "all"):
+        rows.append(f"{name:18}" + "".join(f"{found[name][k]:>12} of {allowed[name][k]:>6}" for k in KINDS))
+    sys.stdout.write("\n".join(rows) + "\n")
 
 
 if __name__ == "__main__":

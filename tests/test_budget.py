@@ -32,8 +32,8 @@ def found():
 def test_a_package_keeps_to_its_budget(package, kind, found):
     allowed = budget()[package][kind]
     assert found[package][kind] <= allowed, (
-        f"{package}: {found[package][kind]} {kind}, budget.toml allows {allowed}: let a mechanism that exists cover the "
-        "case, or change budget.toml in this commit with the reason beside the number"
+        f"{package}: {found[package][kind]} {kind}, budget.toml allows {allowed}: let a mechanism that exists cover "
+        "the case, or change budget.toml in this commit with the reason beside the number"
     )
 
 

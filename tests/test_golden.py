@@ -239,3 +239,16 @@ def test_rounded_tables_are_not_taken_for_whole_ones(tables):
     whole = tables["run/bet"].assign(alt_m=np.sqrt(tables["run/bet"].alt_m))
     assert golden_flights.has_all_digits(whole)
     assert not golden_flights.has_all_digits(whole.map(lambda x: float(f"{x:.10g}") if isinstance(x, float) else x))
+
+
+def test_a_case_of_the_exam_with_another_verdict_code_or_suspect_is_reported_and_an_error_size_is_not():
+    row = {"code": "clock-lag", "suspects": "rates", "error_sd": "1.0", "verdict": "named"}
+    stated = {"gyros early": row, "film late": row}
+    assert golden.exam_differences(stated, {"gyros early": row | {"error_sd": "1.1"}}, ["gyros early"]) == []
+    made = {"gyros early": row | {"verdict": "harmless", "suspects": ""}, "wind in knots": row}
+    assert golden.exam_differences(stated, made, list(stated)) == [
+        "film late: no such case any more",
+        "wind in knots: not in wrong_inputs.csv",
+        "gyros early: verdict: 'harmless' for 'named'",
+        "gyros early: suspects: '' for 'rates'",
+    ]
