@@ -192,6 +192,8 @@ class Gate:
                 return None
         self.digests[path] = found.sha256
         held = {short: place for short, place in places.items() if place[0] in found.columns}
+        if not held:
+            return None
         values = {short: tables.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
         rows = len(next(iter(values.values())))
         return time_s, values, found.first_line + np.arange(rows)

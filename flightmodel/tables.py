@@ -5,8 +5,7 @@ declares column and unit (`Source`); nothing is guessed. This is the only place 
 become SI and radians.
 
 Times are numbers in a unit, ISO 8601 in UTC, or IRIG day of year ``DDD:HH:MM:SS.fff``; the latter lie in t0's year, or
-in the next one where that is nearer (a flight across New Year). Cells of the usual width are read many at a time;
-others, one by one, to the same number.
+in the next one where that is nearer (a flight across New Year).
 
 Units have short names in flight.toml and in the names of canonical columns (``_mps2``, ``_degc``); any other text is
 read by the library pint (``"slug/ft^3"``, ``"deg/hr"``, ``"inHg"``), as long as it is the unit of a quantity that a
@@ -442,9 +441,6 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
 
     text = frame[column].str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
-    read = np.isfinite(values)
-    # pandas 3.0 and before round the last of seventeen digits
-    values[read] = [float(cell) for cell in text.to_numpy(dtype=object)[read]]
     missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
     bad = (~np.isfinite(values)) & ~missing
     if bad.any():
@@ -606,7 +602,6 @@ SECOND_60 = (
     'the times of every table as seconds after t0 (format = "seconds")'
 )
 _IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$", re.ASCII)
-_COLONS, _POINT, _WIDEST = [3, 6, 9], 12, 22  # where the usual form has them; so many digits are exact in float64
 HALF_YEAR_S = 183 * 86400.0
 
 
@@ -624,42 +619,9 @@ def clock_times(cells: Sequence[str], form: str, t0: datetime) -> FloatArray:
 
 
 def _irig_times(cells: Sequence[str], t0: datetime) -> FloatArray:
-    out = np.full(len(cells), np.nan)
-    widths = np.array([len(cell) for cell in cells])
-    for width in np.unique(widths).tolist():
-        rows = np.flatnonzero(widths == width)
-        usual = np.zeros(len(rows), dtype=bool)
-        if _POINT <= width <= _WIDEST:
-            try:
-                table = np.array([cells[k] for k in rows.tolist()], dtype=f"S{width}")
-            except UnicodeEncodeError:
-                table = np.full(len(rows), b"?" * width)
-            usual, seconds = _usual_irig(table.view(np.uint8).reshape(-1, width), t0)
-            out[rows[usual]] = seconds
-        for k in rows[~usual].tolist():
-            match = _IRIG.match(cells[k])
-            if match:
-                day, hour, minute = (np.array([float(match[part])]) for part in (1, 2, 3))
-                out[k] = _seconds(day, hour, minute, np.array([float(match[4])]), t0)[0]
-    return out
-
-
-def _usual_irig(table: np.ndarray, t0: datetime) -> tuple[np.ndarray, FloatArray]:
-    """Which rows of characters have the usual form, and their seconds after t0."""
-    width = table.shape[1]
-    marks = [*_COLONS, _POINT] if width > _POINT else _COLONS
-    digits = np.delete(table, marks, axis=1).astype(np.int64) - ord("0")
-    usual = np.all(table[:, _COLONS] == ord(":"), axis=1) & np.all((digits >= 0) & (digits <= 9), axis=1)
-    if width > _POINT:
-        usual &= table[:, _POINT] == ord(".")
-    digits = digits[usual]
-
-    def number(first: int, last: int) -> FloatArray:
-        return (digits[:, first:last] @ 10 ** np.arange(last - first - 1, -1, -1)).astype(float)
-
-    last = digits.shape[1]
-    second = number(7, last) / 10.0 ** (last - 9)
-    return usual, _seconds(number(0, 3), number(3, 5), number(5, 7), second, t0)
+    rows = [cell if _IRIG.match(cell) else "nan:nan:nan:nan" for cell in cells]
+    day, hour, minute, second = np.loadtxt(rows, delimiter=":", ndmin=2).T
+    return _seconds(day, hour, minute, second, t0)
 
 
 def _seconds(day: FloatArray, hour: FloatArray, minute: FloatArray, second: FloatArray, t0: datetime) -> FloatArray:
