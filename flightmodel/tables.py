@@ -161,15 +161,7 @@ def _read(text: str) -> Unit | None:
     try:
         unit = registry.parse_units(plain)
         ends = [registry.Quantity(x, unit).to_base_units() for x in (0.0, 1.0)]
-    except (
-        library.errors.PintError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        SyntaxError,
-        AssertionError,
-    ):
+    except (library.errors.PintError, *_UNREADABLE):
         return None
     powers = dict(ends[0].dimensionality)
     found = *(powers.pop(base, 0) for base in _BASES), "radian" in str(ends[1].units)
@@ -187,7 +179,8 @@ def _library() -> tuple[Any, Any]:
     return pint, pint.UnitRegistry()
 
 
-def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+def ordered_spans(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Refuse spans of which one does not end after it begins."""
     for start, stop in value:
         if not start < stop:
             raise ValueError(f"a span ends after it begins; {start:g} to {stop:g} s does not")
@@ -195,7 +188,7 @@ def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, floa
 
 
 # first and last second of each
-Spans = Annotated[tuple[tuple[Time, Time], ...], Field(min_length=1, max_length=100), AfterValidator(_in_order)]
+Spans = Annotated[tuple[tuple[Time, Time], ...], Field(min_length=1, max_length=100), AfterValidator(ordered_spans)]
 
 
 class ColumnEntry(Section):
