@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
@@ -24,7 +24,7 @@ from flightmodel.config import (
     Angle,
     Duration,
     Elevation,
-    KeyFaults,
+    KeyFault,
     Label,
     Latitude,
     Longitude,
@@ -132,17 +132,16 @@ class AttitudeEntry(Section):
             return (float(value),) * 3
         return value
 
-    @model_validator(mode="after")
-    def _one_form(self) -> AttitudeEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
-            raise ValueError("q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place")
-        if self.q_ecef_body is None and any(v is None for v in pointing):
-            raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
-        if (place[0] is None) != (place[1] is None):
-            raise ValueError("latitude_deg and longitude_deg belong together")
-        return self
+            yield "", None, "q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place"
+        elif self.q_ecef_body is None and any(v is None for v in pointing):
+            yield "", None, "write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis"
+        elif (place[0] is None) != (place[1] is None):
+            yield "", None, "latitude_deg and longitude_deg belong together"
 
 
 class StartEntry(Section):
@@ -154,15 +153,14 @@ class StartEntry(Section):
     azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
     state: StateEntry | None = None
 
-    @model_validator(mode="after")
-    def _ordered(self) -> StartEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
-            raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
+            yield "at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s"
         if self.at_rest is None and self.azimuth_deg is not None:
-            raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
+            yield "azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too"
         if self.at_rest is not None and self.state is not None:
-            raise KeyFaults([("state", "...", "a start at rest has its own state; keep at_rest or state")])
-        return self
+            yield "state", "...", "a start at rest has its own state; keep at_rest or state"
 
 
 class PlaceEntry(Section):
@@ -185,13 +183,12 @@ class UnmodelledEntry(Section):
     sd_mps2: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
-    @model_validator(mode="after")
-    def _something(self) -> UnmodelledEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.from_s < self.to_s:
-            raise KeyFaults([("to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s")])
+            yield "to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s"
         if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
-            raise KeyFaults([("sd_mps2", 0.0, "state sd_mps2, sd_degps or both")])
-        return self
+            yield "sd_mps2", 0.0, "state sd_mps2, sd_degps or both"
 
 
 class MotionEntry(Section):

@@ -26,7 +26,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -34,11 +34,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 from scipy import constants
 
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, IntArray, nearest_name
-from flightmodel.config import KeyFaults, Section, Time
+from flightmodel.config import KeyFault, Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
 
@@ -218,11 +218,10 @@ class TimeEntry(Section):
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0  # a spacecraft's clock counts from 1980 or 2000
     repeats: Literal["refuse", "first"] = "refuse"
 
-    @model_validator(mode="after")
-    def _three_or_one(self) -> TimeEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if (self.format == "utc_hms") != (self.columns is not None):
-            raise ValueError('format = "utc_hms" and columns = ["hour", "minute", "second"] belong together')
-        return self
+            yield "", None, 'format = "utc_hms" and columns = ["hour", "minute", "second"] belong together'
 
 
 class Source(Section):
@@ -640,11 +639,10 @@ class ThinnedSpan(Section):
     to_s: Time | None = None
     components: tuple[Component, ...] = ()
 
-    @model_validator(mode="after")
-    def _in_order(self) -> ThinnedSpan:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.from_s is not None and self.to_s is not None and self.to_s <= self.from_s:
-            raise KeyFaults([("to_s", self.to_s, f"is not after from_s = {self.from_s:g}; swap the two")])
-        return self
+            yield "to_s", self.to_s, f"is not after from_s = {self.from_s:g}; swap the two"
 
     def holds(self, time_s: FloatArray, component: str) -> BoolArray:
         """Which rows (n,) of a component it is about."""

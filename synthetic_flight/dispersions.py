@@ -8,17 +8,17 @@ worker or a thousand, and one factor more or less leaves the others' numbers as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 from scipy.special import ndtri
 
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.config import KeyFaults, NonNegative, Section, Time
+from flightmodel.config import KeyFault, NonNegative, Section, Time
 from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
 from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
@@ -36,15 +36,14 @@ class Shift(Section):
     normal: NonNegative | None = None
     uniform: tuple[Number, Number] | None = None
 
-    @model_validator(mode="after")
-    def _one(self) -> Shift:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
             names = ", ".join(type(self).model_fields)
-            raise ValueError(f"exactly one of {names} is wanted; got {', '.join(given) or 'none'}")
-        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
-            raise KeyFaults([("uniform", list(self.uniform), "a lower and a higher bound are wanted")])
-        return self
+            yield "", None, f"exactly one of {names} is wanted; got {', '.join(given) or 'none'}"
+        elif self.uniform is not None and not self.uniform[0] < self.uniform[1]:
+            yield "uniform", list(self.uniform), "a lower and a higher bound are wanted"
 
     def at(self, u: float) -> float:
         """Deviation of which the fraction ``u`` of all draws lies below."""
@@ -134,19 +133,15 @@ class Window(Section):
     record_s: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
     history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
 
-    @model_validator(mode="after")
-    def _fits(self) -> Window:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.from_s < self.to_s:
-            faults.append(("to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"))
+            yield "to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"
         ratio = self.history_s / self.record_s
         if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-            faults.append(("history_s", self.history_s, f"a whole multiple of record_s = {self.record_s:g} is wanted"))
+            yield "history_s", self.history_s, f"a whole multiple of record_s = {self.record_s:g} is wanted"
         if (self.to_s - self.from_s) / self.record_s > 200_000:
-            faults.append(("record_s", self.record_s, "more than 200 000 records a flight; a longer one is wanted"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "record_s", self.record_s, "more than 200 000 records a flight; a longer one is wanted"
 
     @property
     def records(self) -> int:
