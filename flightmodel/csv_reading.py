@@ -134,7 +134,7 @@ def _layout(names: list[str], wanted: Mapping[str, bool], time: TimeColumn | Non
 
 def _parse(rows: bytes, layout: _Layout) -> tuple[dict[str, FloatArray], list[str]]:
     """Numbers of some rows by column, and the cells of the column of text; ValueError where anything is unusual."""
-    if not rows.isascii() or any(mark in rows for mark in ODD):
+    if not rows.isascii() or any(mark in rows for mark in ODD) or rows.count(b"\r") != rows.count(b"\r\n"):
         raise ValueError("not plain rows")
     try:
         from pyarrow import BufferReader, csv, float64, string

@@ -475,15 +475,24 @@ class Vehicle:
 
 def vehicle_path(name: str, beside: Path | None = None) -> Path:
     """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
+    return path_of("vehicle", name, "vehicle-unknown", beside)
+
+
+def shipped(kind: str) -> list[str]:
+    """Names of the vehicles or scenarios that ship with the toolkit."""
+    return sorted(path.stem for path in (DATA / f"{kind}s").glob("*.toml"))
+
+
+def path_of(kind: str, name: str, code: str, beside: Path | None = None) -> Path:
+    """Find a file of a kind (vehicle, scenario): its path, or the name of a shipped one; refuse others with a code."""
     if "\0" in name:
-        raise ConfigError(f"vehicle {name!r}: a path holds no NUL character", code="path-nul")
+        raise ConfigError(f"{kind} {name!r}: a path holds no NUL character", code="path-nul")
     if name.endswith(".toml"):
         return (beside or Path()) / name
-    shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
-    if name not in shipped:
-        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no vehicle '{name}'{hint}", code="vehicle-unknown")
-    return DATA / "vehicles" / f"{name}.toml"
+    if name not in shipped(kind):
+        hint = f"{nearest_name(name, shipped(kind))}; shipped: {', '.join(shipped(kind))}; a path ends in .toml"
+        raise ConfigError(f"no {kind} '{name}'{hint}", code=code)
+    return DATA / f"{kind}s" / f"{name}.toml"
 
 
 def read_vehicle(name: str | Path) -> Vehicle:

@@ -19,6 +19,7 @@ from scipy.special import ndtri
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import KeyFault, NonNegative, Section, Time
+from flightmodel.instruments import with_keys
 from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
 from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
@@ -62,19 +63,9 @@ class Factor(Shift):
         return float(np.expm1(self.lognormal * ndtri(u))) if self.lognormal is not None else super().at(u)
 
 
+@with_keys(dict.fromkeys(Initial.model_fields, (Shift | None, None)))
 class InitialDispersions(Section):
     """Of the state at the start of the scenario; keys and units are the scenario's own."""
-
-    latitude_deg: Shift | None = None
-    longitude_deg: Shift | None = None
-    altitude_m: Shift | None = None
-    speed_mps: Shift | None = None
-    flight_path_deg: Shift | None = None
-    azimuth_deg: Shift | None = None
-    nose_azimuth_deg: Shift | None = None
-    nose_elevation_deg: Shift | None = None
-    roll_deg: Shift | None = None
-    spin_rpm: Shift | None = None
 
 
 class MassDispersions(Section):
@@ -263,15 +254,11 @@ def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     # the offset is the whole vehicle's, the centerbody carries it
     carried = (vehicle.mass_kg / body.mass_kg) * np.array([0.0, of("mass.offset_y_m"), of("mass.offset_z_m")])
-    springs = {
-        "station_m": joint.station_m + of("joint.station_m"),
+    shifted = ("station_m", "freeplay_deg", "quadratic_nmprad2", "hardening_nmprad3", "damping_hardening_nmsprad3")
+    springs = {key: getattr(joint, key) + of(f"joint.{key}") for key in shifted} | {
         "bending_stiffness_nmprad": joint.bending_stiffness_nmprad * (1.0 + of("joint.stiffness")),
         "bending_damping_nmsprad": joint.bending_damping_nmsprad * (1.0 + of("joint.damping")),
         "torsion_stiffness_nmprad": joint.torsion_stiffness_nmprad * (1.0 + of("joint.torsion_stiffness")),
-        "freeplay_deg": joint.freeplay_deg + of("joint.freeplay_deg"),
-        "quadratic_nmprad2": joint.quadratic_nmprad2 + of("joint.quadratic_nmprad2"),
-        "hardening_nmprad3": joint.hardening_nmprad3 + of("joint.hardening_nmprad3"),
-        "damping_hardening_nmsprad3": joint.damping_hardening_nmsprad3 + of("joint.damping_hardening_nmsprad3"),
     }
     return replace(
         vehicle,

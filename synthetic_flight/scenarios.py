@@ -33,7 +33,7 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
-from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
+from flightmodel.vehicle import Vehicle, path_of, shipped, vehicle_from_toml, vehicle_path
 from synthetic_flight.instrument_errors import (
     Accelerometer,
     Attitude,
@@ -214,17 +214,13 @@ class Scenario:
 
 def shipped_scenarios() -> list[str]:
     """Names of the scenarios that ship with the toolkit."""
-    return sorted(p.stem for p in (DATA / "scenarios").glob("*.toml"))
+    return shipped("scenario")
 
 
 def read_scenario(name: str | Path) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
     check_type("scenario", name, (str, Path), "a shipped name or the path of a TOML file")
-    name, shipped = str(name), shipped_scenarios()
-    if not name.endswith(".toml") and name not in shipped:
-        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no scenario '{name}'{hint}", code="scenario-unknown")
-    path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
+    path = path_of("scenario", str(name), "scenario-unknown")
     tables = read_toml(path)
     spec, vehicle = None, None
     faults: list[Fault] = []
@@ -270,17 +266,10 @@ def child_rng(seed: int, name: str) -> np.random.Generator:
 def initial_state(scenario: Scenario) -> FloatArray:
     """State (20,) at the scenario's start, joint undeflected."""
     spec, start = scenario.spec.initial, scenario.spec.time.start_s
-    lat, lon, path, azimuth, nose_az, nose_el, roll = np.deg2rad(
-        [
-            spec.latitude_deg,
-            spec.longitude_deg,
-            spec.flight_path_deg,
-            spec.azimuth_deg,
-            spec.nose_azimuth_deg,
-            spec.nose_elevation_deg,
-            spec.roll_deg,
-        ]
+    lat, lon, path, azimuth = np.deg2rad(
+        [spec.latitude_deg, spec.longitude_deg, spec.flight_path_deg, spec.azimuth_deg]
     )
+    nose_az, nose_el, roll = np.deg2rad([spec.nose_azimuth_deg, spec.nose_elevation_deg, spec.roll_deg])
     position = earth.ecef_from_geodetic(lat, lon, spec.altitude_m)
     heading = np.array([np.cos(path) * np.cos(azimuth), np.cos(path) * np.sin(azimuth), -np.sin(path)])
     velocity = earth.ecef_from_ned(spec.speed_mps * heading, position)
