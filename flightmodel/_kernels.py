@@ -90,11 +90,6 @@ def kernel(function):
     return _kept(function, nogil=True, error_model="numpy", fastmath=FASTMATH)
 
 
-def exact_kernel(function):
-    """Compile as `kernel` does, but every operation as it is written: for what must round correctly."""
-    return _kept(function, nogil=True, error_model="numpy")
-
-
 class Part(CPUDispatcher):
     """A function that is compiled into the kernels that call it, without an entry of its own.
 
@@ -120,11 +115,6 @@ def _part(function, **options):
     if isinstance(part, CPUDispatcher):  # else numba is switched off
         part.__class__ = Part
     return part
-
-
-def exact_inlined(function):
-    """Compile as `exact_kernel` does, as a part of every kernel that calls it."""
-    return _part(function)
 
 
 def inlined(function):

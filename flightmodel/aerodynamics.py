@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -39,17 +40,17 @@ from typing import Annotated, Any, Literal
 from xml.parsers import expat
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
 from flightmodel.config import (
     FileBeside,
     Fraction,
-    KeyFaults,
+    KeyFault,
     Length,
     Place,
     Section,
-    check_one_of,
+    one_of,
     read_section,
 )
 from flightmodel.files import file_bytes, nothing_at
@@ -526,11 +527,10 @@ class Knots(Section):
     mach: tuple[MachNumber, ...]
     value: tuple[Factor, ...]
 
-    @model_validator(mode="after")
-    def _matched(self) -> Knots:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.mach or len(self.mach) != len(self.value) or not _increase(self.mach):
-            raise ValueError("as many values as Mach numbers, which increase, are wanted")
-        return self
+            yield "", None, "as many values as Mach numbers, which increase, are wanted"
 
 
 class DampingTable(Section):
@@ -540,14 +540,13 @@ class DampingTable(Section):
     alpha_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
     value: tuple[tuple[Coefficient, ...], ...]
 
-    @model_validator(mode="after")
-    def _matched(self) -> DampingTable:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         sizes = {len(row) for row in self.value}
         if len(self.value) != len(self.mach) or sizes != {len(self.alpha_deg)}:
-            raise ValueError("one row a Mach number and one value an angle are wanted")
+            yield "", None, "one row a Mach number and one value an angle are wanted"
         if not _increase(self.mach) or not _increase(self.alpha_deg):
-            raise ValueError("Mach numbers and angles must increase")
-        return self
+            yield "", None, "Mach numbers and angles must increase"
 
 
 class SphereCone(Section):
@@ -562,20 +561,16 @@ class SphereCone(Section):
     cmq: Coefficient | None = None
     cmq_table: DampingTable | None = None
 
-    @model_validator(mode="after")
-    def _possible(self) -> SphereCone:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         widest = self.base_radius_m / float(np.cos(np.deg2rad(self.half_angle_deg)))
         if self.nose_radius_m >= widest:
             words = f"the nose cap is wider than the base; below {widest:.4g} m for this base and angle"
-            faults.append(("nose_radius_m", self.nose_radius_m, words))
+            yield "nose_radius_m", self.nose_radius_m, words
         if (self.cmq is None) == (self.cmq_table is None):
-            faults.append(("cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"))
+            yield "cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"
         if not _increase(self.mach):
-            faults.append(("mach", self.mach, "Mach numbers must increase"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "mach", self.mach, "Mach numbers must increase"
 
 
 class FreeMolecular(Section):
@@ -592,10 +587,9 @@ class Aerodynamics(Section):
     sphere_cone: SphereCone | None = None
     free_molecular: FreeMolecular | None = None
 
-    @model_validator(mode="after")
-    def _one(self) -> Aerodynamics:
-        check_one_of(self, "table", "sphere_cone")
-        return self
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        yield from one_of(self, "table", "sphere_cone")
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,22 @@ from __future__ import annotations
 import os
 import tomllib
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
 from flightmodel.files import file_bytes, leads_outside, nothing_at
@@ -58,19 +67,17 @@ def beside(value: str) -> str:
 
 FileBeside = Annotated[str, AfterValidator(beside)]
 
+# key below the table that is checked ("" for the table), its value, what is wrong; a `Fault` has its own code
+KeyFault = tuple[str, object, str]
+
 
 class KeyFaults(ValueError):
-    """What keys of a table do not fit each other; `parse_section` makes a sentence of each.
+    """What keys of a table do not fit each other; `parse_section` makes a sentence of each `KeyFault`."""
 
-    Parameters
-    ----------
-    faults : list of (str, object, str)
-        Key below the table that is checked, its value, what is wrong and what to try; a `Fault` has its own code.
-    """
-
-    def __init__(self, faults: list[tuple[str, object, str]]) -> None:
+    def __init__(self, faults: list[KeyFault]) -> None:
         self.faults = tuple(faults)
-        super().__init__("; ".join(f"{key} = {_shown(value)}: {words}" for key, value, words in faults))
+        shown = (f"{key} = {_shown(value)}: {words}" if key else words for key, value, words in faults)
+        super().__init__("; ".join(shown))
 
 
 class Section(BaseModel):
@@ -96,6 +103,16 @@ class Section(BaseModel):
             if isinstance(leaf, (int, float)) and wanted == {bool} and not isinstance(leaf, bool):
                 raise ValueError("true or false is wanted")
         return value
+
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what keys do not fit each other; each is sound by itself."""
+        return ()
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> Self:
+        if faults := [*self.key_faults()]:
+            raise KeyFaults(faults)
+        return self
 
 
 @cache  # a study checks the same few fields a hundred thousand times
@@ -207,13 +224,11 @@ def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
         words = f"a table is wanted here, with keys among {', '.join(_keys_beside(model, path))}"
     cause = item.get("ctx", {}).get("error")
     if isinstance(cause, KeyFaults):
-        return [
-            Fault(
-                f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}",
-                getattr(text, "code", "keys-conflict"),
-            )
-            for name, v, text in cause.faults
-        ]
+        out = []
+        for name, value, text in cause.faults:
+            at = f"'{'.'.join([*path, name])}' = {_shown(value)}" if name else f"'{key}'"
+            out.append(Fault(f"{where}: key {at}: {text}", getattr(text, "code", "keys-conflict")))
+        return out
     if isinstance(item["input"], (dict, BaseModel)):
         return [Fault(f"{where}: key '{key}': {words}", "keys-conflict")]
     return [Fault(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
@@ -241,7 +256,7 @@ def parse_utc(text: str) -> datetime:
     return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)
 
 
-def check_one_of(section: Section, first: str, second: str) -> None:
-    """Raise `ValueError` where a section states neither of two keys, or both."""
+def one_of(section: Section, first: str, second: str) -> Iterator[KeyFault]:
+    """Yield that a section states neither of two keys, or both."""
     if (getattr(section, first) is None) == (getattr(section, second) is None):
-        raise ValueError(f"either {first} or {second} is wanted, and not both")
+        yield "", None, f"either {first} or {second} is wanted, and not both"

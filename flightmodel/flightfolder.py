@@ -9,13 +9,13 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
@@ -24,7 +24,7 @@ from flightmodel.config import (
     Angle,
     Duration,
     Elevation,
-    KeyFaults,
+    KeyFault,
     Label,
     Latitude,
     Longitude,
@@ -132,17 +132,16 @@ class AttitudeEntry(Section):
             return (float(value),) * 3
         return value
 
-    @model_validator(mode="after")
-    def _one_form(self) -> AttitudeEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
-            raise ValueError("q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place")
-        if self.q_ecef_body is None and any(v is None for v in pointing):
-            raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
-        if (place[0] is None) != (place[1] is None):
-            raise ValueError("latitude_deg and longitude_deg belong together")
-        return self
+            yield "", None, "q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place"
+        elif self.q_ecef_body is None and any(v is None for v in pointing):
+            yield "", None, "write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis"
+        elif (place[0] is None) != (place[1] is None):
+            yield "", None, "latitude_deg and longitude_deg belong together"
 
 
 class StartEntry(Section):
@@ -154,15 +153,14 @@ class StartEntry(Section):
     azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
     state: StateEntry | None = None
 
-    @model_validator(mode="after")
-    def _ordered(self) -> StartEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
-            raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
+            yield "at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s"
         if self.at_rest is None and self.azimuth_deg is not None:
-            raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
+            yield "azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too"
         if self.at_rest is not None and self.state is not None:
-            raise KeyFaults([("state", "...", "a start at rest has its own state; keep at_rest or state")])
-        return self
+            yield "state", "...", "a start at rest has its own state; keep at_rest or state"
 
 
 class PlaceEntry(Section):
@@ -185,13 +183,12 @@ class UnmodelledEntry(Section):
     sd_mps2: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
-    @model_validator(mode="after")
-    def _something(self) -> UnmodelledEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.from_s < self.to_s:
-            raise KeyFaults([("to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s")])
+            yield "to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s"
         if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
-            raise KeyFaults([("sd_mps2", 0.0, "state sd_mps2, sd_degps or both")])
-        return self
+            yield "sd_mps2", 0.0, "state sd_mps2, sd_degps or both"
 
 
 class MotionEntry(Section):
@@ -294,60 +291,54 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self, needs_path: bool = True) -> list[Fault]:
-        """Return what does not go together, each with what to write instead.
+    def misfits(self, needs_path: bool = True) -> Iterator[Fault]:
+        """Yield what does not go together, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
         """
-        out = self._misfits_of_planet()
+        yield from self._misfits_of_planet()
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
-            out.append(Fault(words, "drag-twice"))
+            yield Fault(words, "drag-twice")
         if needs_path or self.radars or self.gnss or not self.films:
-            out += self._misfits_of_path()
+            yield from self._misfits_of_path()
         if self.films and self.vehicle is None:
             tables = ", ".join(self.films)
-            out.append(
-                Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
-            )
+            yield Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
-            out.append(Fault(words, "frames-twice"))
+            yield Fault(words, "frames-twice")
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
             if name in _TAKEN:
                 words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
-            out.append(Fault(words, "name-twice"))
-        return out
+            yield Fault(words, "name-twice")
 
-    def _misfits_of_planet(self) -> list[Fault]:
-        """Return what is known of the Earth alone."""
-        out: list[Fault] = []
+    def _misfits_of_planet(self) -> Iterator[Fault]:
+        """Yield what is known of the Earth alone."""
         if self.body == WGS84:
-            return out
+            return
         where = f'planet = "{self.planet}"'
         if self.sensors.magnetometer is not None:
-            out.append(Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown"))
+            yield Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown")
         if self.sensors.sun is not None:
             words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
-            out.append(Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown"))
+            yield Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown")
         for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
             for name, entry in entries.items():
                 if entry.height_is == "msl" and entry.geoid_undulation_m is None:
                     words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
-                    out.append(Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown"))
+                    yield Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown")
         if self.start.at_rest is not None:
             words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
-            out.append(Fault(f"start.at_rest: {where}: {words}", "rest-unknown"))
-        return out
+            yield Fault(f"start.at_rest: {where}: {words}", "rest-unknown")
 
-    def _misfits_of_drag(self) -> list[Fault]:
-        """Return what ballistic flight and an accelerometer without gyros lack."""
-        out = []
+    def _misfits_of_drag(self) -> Iterator[Fault]:
+        """Yield what ballistic flight and an accelerometer without gyros lack."""
         if self.motion.model == "ballistic" and self.motion.drag_area_per_mass_m2pkg is None and self.drag is None:
             words = "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd), or [drag]"
-            out.append(Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict"))
+            yield Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict")
         entry = self.sensors.accelerometer
         if entry is not None and self.measures_deceleration and entry.mount in (None, "body"):
             axial = entry.dcm_body_sensor[0]
@@ -356,42 +347,40 @@ class FlightFile(Section):
                 words = (
                     f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
                 )
-                out.append(Fault(f"sensors.accelerometer: {words}", "axial-missing"))
+                yield Fault(f"sensors.accelerometer: {words}", "axial-missing")
         elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
             words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
-            out.append(Fault(f"sensors.accelerometer.{words}", "inertial-missing"))
-        return out
+            yield Fault(f"sensors.accelerometer.{words}", "inertial-missing")
 
-    def _misfits_of_path(self) -> list[Fault]:
-        """Return what keeps a path from being found."""
-        out = self._misfits_of_drag()
+    def _misfits_of_path(self) -> Iterator[Fault]:
+        """Yield what keeps a path from being found."""
+        yield from self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
         if not self.radars and not self.gnss and self.start.state is None:
             also = "; a barometer alone gives no place" if self.barometers else ""
             words = (
                 f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them, or [start.state]{also}"
             )
-            out.append(Fault(words, "tracker-missing"))
+            yield Fault(words, "tracker-missing")
         if len(triads) == 1 and not self.measures_deceleration:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
             words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
             if triads == ["accelerometer"]:
                 words += ', or write model = "ballistic" in [motion], where an accelerometer measures the drag'
-            out.append(Fault(words, "inertial-missing"))
+            yield Fault(words, "inertial-missing")
         if self.motion.model == "strapdown" and not triads:
             words = (
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
-            out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
+            yield Fault(f'motion.model = "strapdown" {words}', "inertial-missing")
         attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
         if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
             words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
-            out.append(Fault(f"{words}; take [start] out", "rest-without-inertial"))
+            yield Fault(f"{words}; take [start] out", "rest-without-inertial")
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
             words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
-            out.append(Fault(words, "attitude-missing"))
-        return out
+            yield Fault(words, "attitude-missing")
 
 
 def read_flight_file(folder: Path) -> FlightFile:

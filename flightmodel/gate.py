@@ -192,6 +192,8 @@ class Gate:
                 return None
         self.digests[path] = found.sha256
         held = {short: place for short, place in places.items() if place[0] in found.columns}
+        if not held:
+            return None
         values = {short: tables.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
         rows = len(next(iter(values.values())))
         return time_s, values, found.first_line + np.arange(rows)
@@ -438,16 +440,11 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
 
 def _of_one_time(time_s: FloatArray, values: list[FloatArray]) -> tuple[IntArray, IntArray]:
     """Rows that repeat an earlier one, and all rows of the times at which rows differ; both as delivered."""
-    order = np.argsort(time_s, kind="stable")
-    same = np.diff(time_s[order]) == 0.0
-    equal = same.copy()
-    for column in values:
-        one, other = column[order[:-1][equal]], column[order[1:][equal]]
-        equal[equal] = (one == other) | (np.isnan(one) & np.isnan(other))
-    instant = np.append(0, np.cumsum(~same))
-    torn = np.isin(instant, instant[1:][same & ~equal])
-    again = np.append(False, same) & ~torn
-    return np.sort(order[again]), np.sort(order[torn])
+    rows = pd.DataFrame(np.column_stack([time_s, *values]))
+    again = rows.duplicated()
+    times = rows.loc[~again, 0]
+    torn = rows[0].isin(times[times.duplicated()])
+    return np.flatnonzero(again & ~torn), np.flatnonzero(torn)
 
 
 def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArray:

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,11 +32,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
-from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
+from flightmodel.config import FileBeside, KeyFault, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
 from flightmodel.mesh_sections import section_supports, touching_circles
@@ -117,27 +118,23 @@ class ShellGeometry(Section):
         shell._mesh = mesh
         return shell
 
-    @model_validator(mode="after")
-    def _possible(self) -> ShellGeometry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
         outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
-        faults: list[tuple[str, object, str]] = []
         if self.nose_radius_m * np.cos(angle) >= base:
             words = f"the nose cap is wider than the base; below {base / np.cos(angle):.4g} m for this base and angle"
-            faults.append(("nose_radius_m", self.nose_radius_m, words))
+            yield "nose_radius_m", self.nose_radius_m, words
         if self.torus_minor_radius_m >= self.innermost_torus_radius_m:
             words = (
                 f"wanted below innermost_torus_radius_m = {self.innermost_torus_radius_m:g}, or the torus has no hole"
             )
-            faults.append(("torus_minor_radius_m", self.torus_minor_radius_m, words))
+            yield "torus_minor_radius_m", self.torus_minor_radius_m, words
         if outermost - self.torus_minor_radius_m >= base:
             words = f"the outermost of {self.torus_count} tori, of radius {outermost:.4g} m, lies outside the base"
-            faults.append(("base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"))
+            yield "base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"
         if self.centerbody_radius_m >= base:
-            faults.append(("centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"
 
 
 def torus_circles(geometry: ShellGeometry) -> tuple[FloatArray, FloatArray]:
@@ -353,17 +350,13 @@ class MeshFile(Section):
     zero_clock: Axis | None = None
     nose: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
 
-    @model_validator(mode="after")
-    def _usable(self) -> MeshFile:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if Path(self.file).suffix.lower() not in KINDS:
-            faults.append(("file", self.file, f"a mesh ends in {', '.join(KINDS)}"))
+            yield "file", self.file, f"a mesh ends in {', '.join(KINDS)}"
         if self.zero_clock is not None and self.zero_clock[-1] == self.forward[-1]:
             words = f"the axis towards clocking angle 0 lies across forward = '{self.forward}'"
-            faults.append(("zero_clock", self.zero_clock, words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "zero_clock", self.zero_clock, words
 
     @property
     def rows(self) -> FloatArray:

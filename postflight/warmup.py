@@ -116,15 +116,6 @@ def _smoothers() -> None:
     propagation.propagate(problem.motion, 0, 1, problem.start)
 
 
-def _tables() -> None:
-    from flightmodel import _csv_kernels as kernels
-
-    data, slots = np.frombuffer(b"1.5\n\0\0\0", dtype=np.uint8).copy(), np.zeros(1, dtype=np.int64)
-    powers = kernels.powers_of_five()
-    spans = np.empty((2, 0), dtype=np.int64)
-    kernels.read_rows(data, 0, 4, slots, kernels.EXACT_TENS, *powers, np.empty((1, 1)), spans, 0)
-
-
 def _balance() -> None:
     from estimators import _balance_kernels as kernels
 
@@ -172,13 +163,12 @@ GROUPS: dict[str, Callable[[], None]] = {
     "ensembles": _ensembles,
     "creep": _creep,
     "balance": _balance,
-    "tables": _tables,
     "spans": _spans,
 }
 # what shares its parts: in one process these are compiled once. With the seconds that it takes; only ratios count
 _FAMILIES: dict[tuple[str, ...], int] = {
     ("filter", "smoothers"): 18, ("camera",): 18, ("simulator", "ensembles", "creep"): 8, ("balance",): 3,
-    ("tables",): 2, ("spans",): 2,
+    ("spans",): 2,
 }  # fmt: skip
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 

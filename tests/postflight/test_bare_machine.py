@@ -12,11 +12,10 @@ from tests.refusing import printed_codes
 CACHES = ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "MPLCONFIGDIR", "POSTFLIGHT_CACHE")
 # `kernel` compiles; `style` imports what draws
 USE = """
-from flightmodel import _csv_kernels, _kernels
+from flightmodel import _kernels
 import postflight.plots.deflection, postflight.commands as commands
 commands.compile_kernels()
 commands.compile_kernels()
-_csv_kernels.powers_of_five()
 import flightmodel.earth
 print(_kernels.CACHE.path or "none")
 """
