@@ -18,15 +18,6 @@ by about 0.1 px, for `estimators.frame_solution.AprioriSd` to allow for.
 
 Assumed of the search from far: the sky is darker than the shell's rim; the Sun is out of view. A frame in which this
 does not hold is refused, with the reason.
-
-A frame that shows the edge twice is two pictures mixed into one (`second_edge`). A second edge is the first one
-turned: it lies ``J m`` px from it, ``J`` the derivative of the edge's place by a deflection. Along a line across
-every edge point, steps of the edge's sign are sought; of all turns ``m`` the one is taken for which most points have a
-step there. The limb of the Earth, torus and shadow are steps too, but follow no turned edge far: in 435 sound frames of
-28 films, with and without the Earth, 0.4 of the points agree at the most. A ring painted or sewn round the shell does;
-it is known by the points that agree with another radius.
-
-Assumed there: the two are apart by more than an edge's blur, and the weaker one stands out of the scatter.
 """
 
 from __future__ import annotations
@@ -41,7 +32,6 @@ from scipy.special import ndtr
 
 from estimators import _edge_kernels
 from flightmodel.checks import BoolArray, Fault, FloatArray
-from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
 NO_FAULT = Fault("")
@@ -68,12 +58,8 @@ _MOST_COMBED = 0.015  # 0.3 % is the most in 408 sound frames; fields a second a
 # breaks across a picture, grey levels over twice the rows beside: in 408 sound frames 2.4 at the most, if rolled 6
 _BREAK_MOST, _BREAK_BESIDE, _BREAK_OVER = 16, 5, 3.5
 _SMOOTHING = cv2.getGaussianKernel(7, _SMOOTHING_PX, cv2.CV_32F)
-_NEAREST_PX, _FARTHEST_PX = 2.0, 24.0  # nearer is one edge, blurred; farther inside is the next torus
-_LEAST_STEP, _OF_SCATTER = 0.05, 3.0  # of the first edge's step; of the scatter of what is no step
-_ENOUGH_POINTS, _LEAST_POINTS, _LEAST_PART = 120, 30, 0.3  # looked at; that a turn moves far enough, and of all
-_DOUBLED, _BEYOND_RING = 0.55, 0.2  # a turn shares some of a ring's points, where it moves them as far
-LIKE_DOUBLED = 0.36  # a frame that may be; one of 850 sound ones of 37 films is
-_MORE_PX = 20  # that a second edge is looked for beyond the first
+_LEAST_POINTS = 30  # for a mean profile across the edge
+_MORE_PX = 20  # smoothed beyond what is asked for: the next search lies beside the first
 _ACROSS_PX = 2.0  # on either side of an edge's middle: more of the shell has shades of its own
 
 
@@ -395,49 +381,3 @@ def steepness_of(image: Image | KeptPicture, horizon: HorizonLine) -> float:
     whole = levels[:, -1] - levels[:, 0]
     middle, half = levels.shape[1] // 2, round(0.5 / STEP_PX)
     return float(np.sign(whole) @ (levels[:, middle + half] - levels[:, middle - half]) / np.abs(whole).sum())
-
-
-def second_edge(
-    image: Image | KeptPicture, horizon: HorizonLine, by_turn: FloatArray, by_radius: FloatArray
-) -> tuple[float, Fault]:
-    """Share of edge points that agree on a second edge, zero where it is usual; why it is two pictures, if it is.
-
-    Parameters
-    ----------
-    image : (h, w) uint8, or `KeptPicture`
-    horizon : HorizonLine
-        Edge points, ``n`` in all.
-    by_turn : (n, 2) float
-        Derivatives of their places along ``inward_px`` by a deflection, px/rad.
-    by_radius : (n,) float
-        The same by the shell's radius, px/m.
-    """
-    some = slice(None, None, max(1, len(by_turn) // _ENOUGH_POINTS))
-    by_turn, by_radius = by_turn[some], by_radius[some]
-    if len(by_turn) < _LEAST_POINTS:
-        return 0.0, NO_FAULT
-    reach = _FARTHEST_PX + 1.0
-    points, inward = np.ascontiguousarray(horizon.points_px[some]), np.ascontiguousarray(horizon.inward_px[some])
-    lines = ScanLines(points, inward, reach, reach, horizon.line[some])
-    grey, inside = sampled(image, lines, round(2.0 * reach / STEP_PX) + 1)
-    rise, first = np.empty((len(grey), grey.shape[1] - 2)), np.empty(len(grey))
-    _edge_kernels.rises_over_pixel(grey, round(1.0 / STEP_PX), rise, first)
-    least = np.maximum(_LEAST_STEP * first, _OF_SCATTER * NORMAL_MAD * _edge_kernels.middle_of_sizes(rise, _BINS))
-    steps = np.empty(rise.shape, dtype=np.bool_)
-    _edge_kernels.tops(rise, least, steps)
-    whole = (first > 2.0 * least) & inside.all(axis=1)
-    limits = (_NEAREST_PX, _FARTHEST_PX, STEP_PX, max(_LEAST_POINTS, round(_LEAST_PART * len(whole))))
-    steps, by_turn = steps[whole], by_turn[whole]
-    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, (*limits, LIKE_DOUBLED))
-    if share <= LIKE_DOUBLED:
-        return 0.0, NO_FAULT
-    widened, ring = np.column_stack([by_radius, np.zeros_like(by_radius)])[whole], share - _BEYOND_RING
-    if _edge_kernels.share_of_second_edge(steps, widened, (*limits, ring))[0] > ring:
-        return 0.0, NO_FAULT
-    if share <= _DOUBLED:
-        return share, NO_FAULT
-    words = (
-        f"the edge is seen twice: {100.0 * share:.0f} % of its points have a second step where a turn by "
-        f"{np.rad2deg(turn_rad):.1f} deg would put it, as where two pictures were mixed into one"
-    )
-    return share, Fault(words, "picture-doubled")
