@@ -413,7 +413,7 @@ def noise(folder: Path, accept: bool) -> None:
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
 @click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")
-@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
+@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee).")
 def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
