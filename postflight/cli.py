@@ -132,22 +132,6 @@ def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | 
     commands.retry_failed(folder, workers, scheduler)
 
 
-@montecarlo.command(name="sobol")
-@click.argument("dispersions")
-@click.argument("folder", type=FOLDER)
-@click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
-@click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
-@click.option("--by", type=NamedChoice(["factor", "section"]), default="section", show_default=True)
-@workers_and_scheduler
-def montecarlo_sobol(
-    dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
-) -> None:
-    """Say which dispersion of DISPERSIONS makes an output uncertain: Sobol indices, BASE x (columns + 2) flights."""
-    from postflight.montecarlo import commands
-
-    commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
-
-
 @click.group(cls=Commands)
 def study() -> None:
     """The paper's own studies, as tables and figures beside its numbers."""
