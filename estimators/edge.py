@@ -28,6 +28,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.special import ndtr
 
 from estimators import _edge_kernels
@@ -48,7 +49,6 @@ _SD_FLOOR_PX = 0.05  # assumed: cloth and lens are modelled no better
 # points of scenes with and without the Earth behind the rim, the same within a quarter for errors of 0.06 to 1.5 px
 _NOISE_TOGETHER = 2.0 * float(np.sqrt(np.pi)) * _SMOOTHING_PX / STEP_PX
 _MODEL_TOGETHER = 70.0
-_BINS = 4096  # of steps along lines; a hundred of 12,000 share the middle one
 _NEIGHBOURS, _COHERENT_PX = 4, 0.7  # on either side; an edge's own scatter is a few tenths of a pixel
 # rows of two moments: blocks as tall as an edge's blur a few times over and 8 samples wide; of noise alone the ratio of
 # the two differences scatters by a twelfth about one
@@ -156,7 +156,10 @@ def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Fa
     if image.shape != (size_px[1], size_px[0]):
         size = f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
         return Fault(size, "frame-size")
-    low, high, saturated = _edge_kernels.grey_levels(image)
+    # of a part of the pixels: as good, and quicker
+    below = np.cumsum(np.bincount(image[::8, ::4].ravel(), minlength=256))
+    low, high = np.searchsorted(below, [0.05 * below[-1], 0.95 * below[-1]], side="right").tolist()
+    saturated = float(np.mean(image[::4, ::4] >= 254))
     if high < 2.0 * _LEAST_CONTRAST:
         return Fault(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-dark")
     if low > 250 or saturated > 0.5:
@@ -188,9 +191,8 @@ def breaks_across(image: Image | KeptPicture) -> NDArray[np.intp]:
     The shell's edges are curved: no row has a large share of one.
     """
     steps = kept_picture(image).differences[2]
-    found = np.empty(len(steps), dtype=np.bool_)
-    _edge_kernels.breaks(steps, _BREAK_BESIDE, _BREAK_OVER, found)
-    return np.flatnonzero(found)
+    beside = median_filter(steps, 2 * _BREAK_BESIDE + 1, mode="mirror")
+    return np.flatnonzero(steps > 2.0 * beside + _BREAK_OVER)
 
 
 def find_horizon(image: Image | KeptPicture, lines: ScanLines, size_px: tuple[int, int]) -> HorizonLine:
@@ -257,7 +259,7 @@ def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
     near = ScanLines(lines.origin_px, lines.inward_px, _NEAR_PX, _NEAR_PX, lines.index)
     grey, inside = sampled(image, near, len(NEAR_ALONG))
     # the noise, from samples so far apart that smoothing did not correlate them
-    spread = _edge_kernels.middle_of_sizes(grey[:, 6:7] - grey[:, :1], _BINS)
+    spread = float(np.median(np.abs(grey[:, 6] - grey[:, 0])))
     noise = max(spread / (0.6745 * np.sqrt(2.0)), 0.3)
     steps = np.empty(n), np.empty(n), np.empty_like(grey), np.empty(n, dtype=np.bool_)
     _edge_kernels.steps_near(grey, inside, noise, _LEAST_CONTRAST, NEAR_PLACES, NEAR_BASES, *steps)
@@ -300,11 +302,21 @@ class KeptPicture:
 
     @cached_property
     def differences(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """How rows differ; see `_edge_kernels.row_differences`."""
-        h, w = self.image.shape
-        shape = (h - 2) // _BLOCK_PX[0], w // _BLOCK_PX[1]
-        one, two, steps = np.empty(shape), np.empty(shape), np.empty(h - 1)
-        _edge_kernels.row_differences(self.image, *_BLOCK_PX, _BLOCK_STEP_PX, _BREAK_MOST, one, two, steps)
+        """Mean square difference of rows next to each other, and of every other row, in blocks; steps of rows (h - 1,).
+
+        A step is the mean difference of a row from the next, at most `_BREAK_MOST` a pixel.
+        """
+        few = self.image[:, ::_BLOCK_STEP_PX].astype(np.int32)
+        steps = np.minimum(np.abs(np.diff(few, axis=0)), _BREAK_MOST).mean(axis=1)
+        (tall, wide), (h, w) = _BLOCK_PX, self.image.shape
+        down, across, each = (h - 2) // tall, w // wide, wide // _BLOCK_STEP_PX
+        first = few[: down * tall, : across * each]
+        one, two = (
+            ((first - few[rows : rows + down * tall, : across * each]) ** 2)
+            .reshape(down, tall, across, each)
+            .mean(axis=(1, 3))
+            for rows in (1, 2)
+        )
         return one, two, steps
 
     def band(self, span: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], tuple[float, float]]:

@@ -321,23 +321,6 @@ def test_a_point_is_coherent_with_most_of_the_places_beside_it():
     assert not len(is_coherent(line[:0], residual[:0]))
 
 
-def test_rows_differ_as_in_whole_numbers():
-    image = np.random.default_rng(9).integers(0, 256, (54, 75)).astype(np.uint8)
-    image[20:] = 255 - image[20:] // 2
-    one, two, steps = np.empty((3, 2)), np.empty((3, 2)), np.empty(53)
-    _edge_kernels.row_differences(image, 16, 32, 4, 16, one, two, steps)
-    for found, expected in zip((one, two, steps), plain_horizon.row_differences(image, 16, 32, 4, 16), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 1000])
-def test_the_middle_is_the_median(count):
-    values = np.random.default_rng(count).normal(size=(count, 3))[:, :2]
-    for levels in (values, np.rint(values), np.zeros_like(values)):
-        for some in (levels, levels[:, :1].copy()):
-            assert _edge_kernels.middle_of_sizes(some, 64) == np.median(np.abs(some))
-
-
 def patch_of(rng):
     """A picture of smooth noise, and the template about its middle."""
     grey = cv2.GaussianBlur(rng.standard_normal((60, 64)), (0, 0), 2.0)

@@ -65,14 +65,3 @@ def first_lasting_steps(grey, inside, limits):
     before, here, after = (slope[rows, at + k] for k in (-1, 0, 1))
     bend = np.minimum(before - 2.0 * here + after, -1e-9)
     return np.where(beyond.any(axis=1), at + np.clip(0.5 * (before - after) / bend, -1.0, 1.0), np.nan)
-
-
-def row_differences(image, tall, wide, step, most):
-    """Mean square differences of rows next to each other, and of every other one, in blocks; mean steps of rows."""
-    few = image[:, ::step].astype(float)
-    steps = np.minimum(np.abs(np.diff(few, axis=0)), most).mean(axis=1)
-    across, down = wide // step, (len(few) - 2) // tall
-    used = image.shape[1] // wide * across
-    near, far = (few[:-2] - few[1:-1]) ** 2, (few[:-2] - few[2:]) ** 2
-    blocks = (part[: down * tall, :used].reshape(down, tall, -1, across).mean(axis=(1, 3)) for part in (near, far))
-    return *blocks, steps
