@@ -22,77 +22,6 @@ def _grey_inside(image, u, v):
 
 
 @inlined
-def _spare(image, count):
-    """Room for so many samples: their pixels' places in the flat picture, shares beyond them, and four levels."""
-    at, levels = np.empty(count, dtype=np.int32), np.empty((4, count), dtype=image.dtype)
-    return at, np.empty(count), np.empty(count), levels
-
-
-@inlined
-def _places_along(u, v, du, dv, first, step, corner_u, corner_v, width, at, right, below):
-    """Places of samples (n,), ``first + k step`` along (du, dv) from (u, v), in the picture from ``corner`` on."""
-    for k in range(len(at)):
-        # of 32 bits: others cannot be made from places in vector registers
-        along = first + np.int32(k) * step
-        x, y = u + along * du - corner_u, v + along * dv - corner_v
-        j, i = np.int32(x), np.int32(y)
-        at[k] = i * np.int32(width) + j
-        right[k], below[k] = x - j, y - i
-
-
-@inlined
-def _levels_there(flat, width, count, spare, grey):
-    """As `_grey_inside`, of so many samples; the loads by themselves, so that all else runs in vector registers."""
-    at, right, below, four = spare
-    one, next_row = np.uint64(1), np.uint64(width)
-    for k in range(count):
-        here = np.uint64(at[k])
-        four[0, k], four[1, k] = flat[here], flat[here + one]
-        four[2, k], four[3, k] = flat[here + next_row], flat[here + next_row + one]
-    for k in range(count):
-        a, b = right[k], below[k]
-        upper = (1.0 - a) * four[0, k] + a * four[1, k]
-        grey[k] = (1.0 - b) * upper + b * ((1.0 - a) * four[2, k] + a * four[3, k])
-
-
-@inlined
-def _levels_along(flat, width, line, first, step, corner, count, spare, grey):
-    """As `_grey_inside`, of so many samples of a line, from (u, v) along (du, dv), in a piece of the picture."""
-    at, right, below, _ = spare
-    u, v, du, dv = line
-    _places_along(
-        u, v, du, dv, first, step, corner[0], corner[1], width, at[:count], right[:count], below[:count]
-    )  # fmt: skip
-    _levels_there(flat, width, count, spare, grey)
-
-
-@inlined
-def _span_within(at, along, low, high, first, last):
-    """Part of a line from ``first`` to ``last`` whose coordinate, ``at`` and so much a pixel along, lies within."""
-    if along == 0.0:
-        return (first, last) if low < at < high else (last, first)
-    one, two = (low - at) / along, (high - at) / along
-    return max(first, min(one, two)), min(last, max(one, two))
-
-
-@inlined
-def _inner_samples(line, first, step, count, image, corner, size):
-    """First and one beyond the last sample of a line that surely lie in the picture, and in the piece of it.
-
-    ``corner`` is the upper left pixel of the piece, ``size`` the picture's.
-    """
-    u, v, du, dv = line
-    h, w = image.shape
-    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
-    begin, end = _span_within(u, du, max(corner[0], 0.0), high_u, first, first + (count - 1) * step)
-    begin, end = _span_within(v, dv, max(corner[1], 0.0), high_v, begin, end)
-    # a sample at a border is left to the comparison with it
-    low = int((begin - first) / step) + 2 if begin > first else 0
-    high = int((end - first) / step) - 1 if end < first + (count - 1) * step else count
-    return min(max(low, 0), count), min(max(high, low, 0), count)
-
-
-@inlined
 def _grey_at(image, u, v):
     """Grey level between pixels, bilinear; the border's beyond the picture."""
     h, w = image.shape
@@ -160,15 +89,8 @@ def band_of_lines(origin, inward, outer, inner, size):
 def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape
-    flat, width, spare = image.ravel(), image.shape[1], _spare(image, m)
     for i in range(n):
-        line = origin[i, 0], origin[i, 1], inward[i, 0], inward[i, 1]
-        begin, end = _inner_samples(line, first, step, m, image, corner, size)
-        for k in range(begin, end):
-            inside[i, k] = True
-        _levels_along(flat, width, line, first + begin * step, step, corner, end - begin, spare, grey[i, begin:])
-        for k in range(m - end + begin):
-            k = k if k < begin else k + end - begin
+        for k in range(m):
             along = first + k * step
             u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
             inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
@@ -360,9 +282,8 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
     is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
     """
     m = 2 * reach + 1
-    dip, grey, spare = np.empty(m), np.empty(3 * m), _spare(image, 3 * m)
+    dip, grey = np.empty(m), np.empty(3 * m)
     h, w = image.shape
-    flat, (at, share_u, share_v, _) = image.ravel(), spare
     for i in range(len(origin)):
         sd[i] = np.inf
         du, dv = across[i]
@@ -373,11 +294,9 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
                 sd[i] = np.inf
                 break
             for c in range(3):
-                part, off_u, off_v = slice(c * m, c * m + m), (c - 1) * dv, (1 - c) * du
-                _places_along(
-                    u0, v0, du, dv, -reach, 1.0, off_u, off_v, w, at[part], share_u[part], share_v[part]
-                )  # fmt: skip
-            _levels_there(flat, w, 3 * m, spare, grey)
+                for k in range(m):
+                    u, v = u0 + (k - reach) * du - (c - 1) * dv, v0 + (k - reach) * dv - (1 - c) * du
+                    grey[c * m + k] = _grey_inside(image, u, v)
             for k in range(m):
                 dip[k] = (grey[m + k] + (grey[k] + grey[2 * m + k])) / 3.0
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
