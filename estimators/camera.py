@@ -30,7 +30,6 @@ from estimators.camera_fit import Image, OrientedCamera
 from estimators.edge import NO_FAULT, no_horizon
 from estimators.frame_edits import edited
 from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
-from estimators.surface_noise import mixed_with
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
 from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, Progress, check_finite, check_increasing
@@ -52,15 +51,12 @@ _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
 _OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
 _NOT_THE_SHELL = (
-    "camera-turned", "picture-warped", "picture-doubled", "edge-not-shell", "features-contradict-edge",
-    "halves-differ", "shell-little-seen", "features-lost", "picture-mixed",
+    "camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge", "halves-differ",
+    "shell-little-seen", "features-lost",
 )  # fmt: skip
 # share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
 # (over so many frames that they are not the benchmark's neighbours alone)
 _PAINTED, _LEAST_PAINTED = 0.25, 3
-# frames with two edges, and of all: of thirty films of two pictures mixed 17 % and more, but for two that are refused
-# otherwise; of eighty sound ones 7 % at the most, one at 0.5 rpm 18 %, where the Earth's limb lies along the rim
-_LEAST_MIXED, _MIXED = 2, 0.15
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _EDGE_FOR_PLANE = 0.5  # of the edge in the benchmark frame: a frame needs half as much, found in both
 _FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
@@ -357,7 +353,7 @@ def judged(
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
     found = without_lost_features(kept) if textured_s is None else without_stray_texture(time_s, kept, textured_s)
-    found = without_remnants(without_doubtful(without_moved(without_mixed(found))))
+    found = without_remnants(without_doubtful(without_moved(found)))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -404,31 +400,6 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
         return fits
     words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
     return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mostly-refused")) for fit in fits]
-
-
-def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse frames that have the noise of an earlier one, and a film of which some do, or show the edge twice.
-
-    A converter of frame rates does that to a whole film: its others mix pictures too, with edges closer together.
-    Frames count that may show the edge twice: one alone may by chance.
-    """
-    mixed = mixed_with([None if fit.refused else fit.noise for fit in fits])
-    doubled = {k for k, f in enumerate(fits) if getattr(f.refused, "code", "") == "picture-doubled" or f.doubled > 0.0}
-    some = len(doubled | set(mixed))
-    if some >= max(_LEAST_MIXED, _MIXED * len(fits)):
-        words = (
-            f"{some} frames show, or may show, the edge twice or the noise of a frame before: the film mixes pictures; "
-            "an edge may lie between two"
-        )
-        return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
-    out = list(fits)
-    for k, (j, share) in mixed.items():
-        words = (
-            f"its noise is in part (correlation {share:.2f}) that of {k - j} frames before: a picture mixed with that "
-            "one, or a part of it held over"
-        )
-        out[k] = refused_fit(fits[k].horizon, Fault(words, "picture-mixed"))
-    return out
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:

@@ -132,22 +132,6 @@ def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | 
     commands.retry_failed(folder, workers, scheduler)
 
 
-@montecarlo.command(name="sobol")
-@click.argument("dispersions")
-@click.argument("folder", type=FOLDER)
-@click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
-@click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
-@click.option("--by", type=NamedChoice(["factor", "section"]), default="section", show_default=True)
-@workers_and_scheduler
-def montecarlo_sobol(
-    dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
-) -> None:
-    """Say which dispersion of DISPERSIONS makes an output uncertain: Sobol indices, BASE x (columns + 2) flights."""
-    from postflight.montecarlo import commands
-
-    commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
-
-
 @click.group(cls=Commands)
 def study() -> None:
     """The paper's own studies, as tables and figures beside its numbers."""
@@ -413,7 +397,7 @@ def noise(folder: Path, accept: bool) -> None:
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
 @click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")
-@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
+@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee).")
 def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command

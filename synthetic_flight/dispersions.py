@@ -25,7 +25,7 @@ from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
 from synthetic_flight.weather import day_of_flight_atmosphere
 
-SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
+_SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
 WIND_FADE_M = (110e3, 130e3)
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 T = TypeVar("T", bound=Section)
@@ -181,7 +181,7 @@ def draws(dispersions: Dispersions, seed: int, run: int) -> dict[str, float]:
 def draw_one(seed: int, run: int, name: str) -> float:
     """Return the number between 0 and 1 of one factor in one run."""
     sequence = np.random.SeedSequence(seed, spawn_key=(run, *name_key(name)))
-    return max(float(np.random.default_rng(sequence).random()), SMALLEST)
+    return max(float(np.random.default_rng(sequence).random()), _SMALLEST)
 
 
 def run_seed(seed: int, run: int) -> int:

@@ -228,7 +228,7 @@ def _wind_table() -> tuple[FloatArray, FloatArray, FloatArray]:
 def seasonal_wind(month: int, latitude_rad: float) -> FloatArray:
     """Zonal-mean wind of a month (1 to 12) and latitude, ``(n, 3)``: altitude km, north (0) and east wind m/s.
 
-    In gradient balance with NRLMSIS 2.1's pressures (``data/atmosphere/mean_winds.py``).
+    In gradient balance with NRLMSIS 2.1's pressures (``tools/mean_winds.py``).
     """
     latitudes, altitude_km, wind = _wind_table()
     east = [np.interp(np.rad2deg(latitude_rad), latitudes, column) for column in wind[month - 1].T]

@@ -43,7 +43,7 @@ from postflight.montecarlo.bands import (
     remove_partial,
     write_chunk,
 )
-from postflight.montecarlo.study import Stop, Study, read_study, run_trials, sobol_study, whole_trial
+from postflight.montecarlo.study import Stop, Study, read_study, run_trials, whole_trial
 from postflight.streams import THREAD_VARIABLES, keep_arrays, pin_threads
 from synthetic_flight.ensemble import fly_runs
 
@@ -241,8 +241,6 @@ def study_of(folder: Path) -> tuple[Study, int]:
     """
     held = read_settings(folder)
     study = read_study(held["source"])
-    if "sobol.base" in held["settings"]:
-        study = sobol_study(study, held["settings"]["sobol.by"], held["settings"]["sobol.base"])
     _check_same(folder, held["settings"], json.loads(json.dumps(study.settings())))
     return study, held["flights"]
 

@@ -1,4 +1,4 @@
-"""How do many flights scatter? Monte Carlo bands, Sobol indices, and the paper's studies of the joint.
+"""How do many flights scatter? Monte Carlo bands, and the paper's studies of the joint.
 
 The paper's (AIAA 2011-2571): Table 3.1 as a figure, Figures 3.1 to 3.3, and Figure 1.3 before and after the joint is
 made flexible.
@@ -16,7 +16,6 @@ from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
 from postflight.studies.shell_test import ShellTest
 
-_MOST_BARS = 15
 _HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
 _LABEL = {
     "alpha_total_deg": "centerbody total\nangle of attack (deg)",
@@ -44,32 +43,6 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
         ax.margins(x=0)
     axes[0].legend()
     axes[-1].set_xlabel(TIME)
-    figure.suptitle(title, fontsize=10)
-    note(figure, synthetic)
-    return figure
-
-
-@in_style
-def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
-    """First-order and total indices with their intervals, the largest total on top."""
-    left_out = max(0, len(table) - _MOST_BARS)
-    table = table.sort_values("total", kind="stable").tail(_MOST_BARS)
-    place = np.arange(len(table))
-    figure = Figure(figsize=(7.2, 0.36 * len(table) + 1.6))
-    ax = figure.subplots()
-    for k, (name, label, colour) in enumerate(
-        (("first", "first order: alone", COLOUR["second"]), ("total", "total: with others", COLOUR["estimate"]))
-    ):
-        at = place + 0.2 * (2 * k - 1)
-        interval = [np.abs(table[f"{name}_{end}_95"] - table[name]) for end in ("low", "high")]
-        ax.barh(at, table[name], 0.36, color=colour, label=label)
-        ax.errorbar(table[name], at, xerr=interval, fmt="none", ecolor=COLOUR["limit"], lw=0.9)
-    ax.set_yticks(place, table["factor"], fontsize=8)
-    ax.axvline(0.0, color=COLOUR["zero"], lw=0.8)
-    more = f"; {left_out} factors with smaller totals are not shown" if left_out else ""
-    ax.set_xlabel(f"share of the variance (bars) and 95 % interval (lines){more}")
-    ax.grid(visible=False, axis="y")
-    ax.legend(loc="lower right")
     figure.suptitle(title, fontsize=10)
     note(figure, synthetic)
     return figure

@@ -40,8 +40,8 @@ from postflight.reconciliation.posterior import (
     posterior_sd,
     posterior_summary,
     quantities,
-    require_samplers,
-    sample_selection,
+    require_sampler,
+    sample,
     stiffness_bound,
     vehicle_file_lines,
 )
@@ -153,7 +153,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     """Reconstruct, reconcile, write a run folder and print the result."""
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled}
     if sampled:
-        require_samplers()
+        require_sampler()
     keep_arrays()
     with SecondProcess() as second, progress_bar() as report:
         report(0.0, "reading telemetry")
@@ -170,8 +170,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         fit, odds = selection.fit, selection.log_odds
         posterior = None
         if sampled:
-            posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
-            odds |= nested
+            posterior = sample(fit, lambda f, what: report(0.6 + 0.3 * f, what))
         report(0.9, "flying entries with the fitted joint")
         laws_flown, vehicle = dispersed(fit)
         second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
@@ -254,8 +253,6 @@ def _posterior_summary(posterior: Posterior | None) -> dict[str, object]:
     return {
         "posterior_refit_error_of_cost": posterior.refit_error.tolist(),
         "posterior_steps_to_forget": posterior.autocorrelation_steps,
-        "posterior_log_evidence_over_laplace": posterior.log_evidence - posterior.fit.log_evidence,
-        "posterior_log_evidence_sd": posterior.log_evidence_sd,
     }
 
 

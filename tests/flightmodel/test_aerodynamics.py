@@ -11,6 +11,7 @@ from flightmodel.sphere_cone import sphere_cone_closed_form, sphere_cone_quadrat
 from tests.refusing import refuses
 
 FOLDER = Path(flightmodel.__file__).parent / "data" / "aerodynamics"
+TOOLS = Path(__file__).parents[2] / "tools"
 SHAPE = (np.deg2rad(60.0), 0.38, 1.5, 3.0)
 # alpha deg, C_A, C_N, C_m about the nose: modified Newtonian, Cp_max = 2, 60 deg, nose 0.38 m, base 1.5 m, to 1e-5
 PRINTED = np.array(
@@ -52,7 +53,7 @@ def test_stagnation_pressure_coefficient():
 
 @pytest.mark.long
 def test_shipped_table_is_what_its_script_makes(table):
-    rows = runpy.run_path(str(FOLDER / "irve2_reference.py"))["rows"]()
+    rows = runpy.run_path(str(TOOLS / "irve2_reference.py"))["rows"]()
     np.testing.assert_allclose(table.coefficients.reshape(-1, 4), rows[:, 2:], atol=6e-5)
 
 

@@ -313,7 +313,6 @@ def test_the_posterior_is_that_of_new_fits(flown):
     table = posterior_summary(sampled).set_index("quantity")
     for name in ("stiffness_nmprad", "cg_offset_y_cm", "cg_offset_z_cm", "static_stability"):
         assert table.sd[name] == pytest.approx(table.linear_sd[name], rel=0.3), name
-    assert abs(sampled.log_evidence - found.log_evidence) < 1.0
 
 
 def test_a_flight_without_a_pulse_is_refused(flown):
