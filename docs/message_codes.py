@@ -16,9 +16,7 @@ OPEN = "..."
 # of a call: which argument is the code, which the words
 CALLS = {
     **dict.fromkeys(("GateError", "ConfigError", "DivergenceError", "TableRangeError"), (1, 0)),
-    **dict.fromkeys(("Fault", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
-    "Finding": (4, 1),
-    "FaultHypothesis": (1, 0),
+    **dict.fromkeys(("Issue", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
     **dict.fromkeys(("line", "_line"), (2, 1)),
     "data_sheet_check": (0, 8),
     "Single": (0, 1),

@@ -46,7 +46,7 @@ from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals
 from estimators.surface_noise import NoisePlaces, SurfaceNoise, noise_places
 from estimators.texture import PaintedTexture
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, Issue
 from flightmodel.deflection import lv_clock
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
@@ -129,7 +129,7 @@ class FrameFit:
     features : int
         Rows of features used.
     horizon : HorizonLine
-    refused : Fault
+    refused : Issue
         Why there is no answer; empty when there is one.
     contradicted : bool
         Whether a whole edge alone gave the answer, against the features.
@@ -160,7 +160,7 @@ class FrameFit:
     residual_rms_px: float
     features: int
     horizon: HorizonLine
-    refused: Fault = NO_FAULT
+    refused: Issue = NO_FAULT
     contradicted: bool = False
     doubled: float = 0.0
     mount_px: float = float("nan")
@@ -235,7 +235,7 @@ def least_points(horizon: HorizonLine) -> int:
 
 
 def refused_fit(
-    horizon: HorizonLine, reason: Fault, mount_px: float = float("nan"), mount_is_sure: bool = True
+    horizon: HorizonLine, reason: Issue, mount_px: float = float("nan"), mount_is_sure: bool = True
 ) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
@@ -270,7 +270,7 @@ class FrameModel:
         Their shift per radian of deflection of the benchmark frame.
     residual_rms_px : float
         Of the benchmark frame.
-    stated_refused : Fault
+    stated_refused : Issue
         Why the features that the vehicle file states are not used; empty where they are, or where it states none.
     support : float
         Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
@@ -294,7 +294,7 @@ class FrameModel:
     posed_covariance: FloatArray = field(repr=False)
     posed_per_deflection: FloatArray = field(repr=False)
     residual_rms_px: float
-    stated_refused: Fault = NO_FAULT
+    stated_refused: Issue = NO_FAULT
     support: float = 1.0
     breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
     steepness: float = float("nan")

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.files import file_bytes, leads_outside, nothing_at
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
@@ -65,7 +65,7 @@ class KeyFaults(ValueError):
     Parameters
     ----------
     faults : list of (str, object, str)
-        Key below the table that is checked, its value, what is wrong and what to try; a `Fault` has its own code.
+        Key below the table that is checked, its value, what is wrong and what to try; a `Issue` has its own code.
     """
 
     def __init__(self, faults: list[tuple[str, object, str]]) -> None:
@@ -154,7 +154,7 @@ def read_section(model: type[SectionT], path: Path) -> SectionT:
         return parse_section(model, tables, str(path))
     except ConfigError as fault:
         absent = [
-            Fault(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
+            Issue(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
             for key, name in _named_files(tables)
             if not any(f"key '{key}'" in words for words in fault.faults) and not leads_outside(path.parent, name)
             if not os.path.exists(path.parent / name)  # False also for a name too long for a file
@@ -190,33 +190,33 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
+def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Issue]:
     """Faults that one item of pydantic's list means."""
     path = [str(part) for part in item["loc"]]
     if path and path[-1] == "[key]":
-        return [Fault(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
+        return [Issue(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])
         hint = f"{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"
-        return [Fault(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
+        return [Issue(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
     if item["type"] == "missing":
-        return [Fault(f"{where}: key '{key}' is missing", "key-missing")]
+        return [Issue(f"{where}: key '{key}' is missing", "key-missing")]
     words = item["msg"].removeprefix("Value error, ")
     if item["type"] == "model_type":
         words = f"a table is wanted here, with keys among {', '.join(_keys_beside(model, path))}"
     cause = item.get("ctx", {}).get("error")
     if isinstance(cause, KeyFaults):
         return [
-            Fault(
+            Issue(
                 f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}",
                 getattr(text, "code", "keys-conflict"),
             )
             for name, v, text in cause.faults
         ]
     if isinstance(item["input"], (dict, BaseModel)):
-        return [Fault(f"{where}: key '{key}': {words}", "keys-conflict")]
-    return [Fault(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
+        return [Issue(f"{where}: key '{key}': {words}", "keys-conflict")]
+    return [Issue(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
 
 
 def _keys_beside(model: Any, path: list[str]) -> list[str]:

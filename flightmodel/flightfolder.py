@@ -19,7 +19,7 @@ from pydantic import Field, field_validator, model_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import (
     Angle,
     Duration,
@@ -76,7 +76,6 @@ from flightmodel.tables import GNSS_SD, Source, Spans
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
-    Finding,
     GnssRecord,
     KnownPlace,
     Motion,
@@ -294,7 +293,7 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self, needs_path: bool = True) -> list[Fault]:
+    def misfits(self, needs_path: bool = True) -> list[Issue]:
         """Return what does not go together, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
@@ -302,52 +301,52 @@ class FlightFile(Section):
         out = self._misfits_of_planet()
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
-            out.append(Fault(words, "drag-twice"))
+            out.append(Issue(words, "drag-twice"))
         if needs_path or self.radars or self.gnss or not self.films:
             out += self._misfits_of_path()
         if self.films and self.vehicle is None:
             tables = ", ".join(self.films)
             out.append(
-                Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
+                Issue(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
             )
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
-            out.append(Fault(words, "frames-twice"))
+            out.append(Issue(words, "frames-twice"))
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
             if name in _TAKEN:
                 words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
-            out.append(Fault(words, "name-twice"))
+            out.append(Issue(words, "name-twice"))
         return out
 
-    def _misfits_of_planet(self) -> list[Fault]:
+    def _misfits_of_planet(self) -> list[Issue]:
         """Return what is known of the Earth alone."""
-        out: list[Fault] = []
+        out: list[Issue] = []
         if self.body == WGS84:
             return out
         where = f'planet = "{self.planet}"'
         if self.sensors.magnetometer is not None:
-            out.append(Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown"))
+            out.append(Issue(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown"))
         if self.sensors.sun is not None:
             words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
-            out.append(Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown"))
+            out.append(Issue(f"[sensors.sun]: {where}: {words}", "sun-unknown"))
         for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
             for name, entry in entries.items():
                 if entry.height_is == "msl" and entry.geoid_undulation_m is None:
                     words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
-                    out.append(Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown"))
+                    out.append(Issue(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown"))
         if self.start.at_rest is not None:
             words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
-            out.append(Fault(f"start.at_rest: {where}: {words}", "rest-unknown"))
+            out.append(Issue(f"start.at_rest: {where}: {words}", "rest-unknown"))
         return out
 
-    def _misfits_of_drag(self) -> list[Fault]:
+    def _misfits_of_drag(self) -> list[Issue]:
         """Return what ballistic flight and an accelerometer without gyros lack."""
         out = []
         if self.motion.model == "ballistic" and self.motion.drag_area_per_mass_m2pkg is None and self.drag is None:
             words = "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd), or [drag]"
-            out.append(Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict"))
+            out.append(Issue(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict"))
         entry = self.sensors.accelerometer
         if entry is not None and self.measures_deceleration and entry.mount in (None, "body"):
             axial = entry.dcm_body_sensor[0]
@@ -356,13 +355,13 @@ class FlightFile(Section):
                 words = (
                     f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
                 )
-                out.append(Fault(f"sensors.accelerometer: {words}", "axial-missing"))
+                out.append(Issue(f"sensors.accelerometer: {words}", "axial-missing"))
         elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
             words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
-            out.append(Fault(f"sensors.accelerometer.{words}", "inertial-missing"))
+            out.append(Issue(f"sensors.accelerometer.{words}", "inertial-missing"))
         return out
 
-    def _misfits_of_path(self) -> list[Fault]:
+    def _misfits_of_path(self) -> list[Issue]:
         """Return what keeps a path from being found."""
         out = self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
@@ -371,26 +370,26 @@ class FlightFile(Section):
             words = (
                 f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them, or [start.state]{also}"
             )
-            out.append(Fault(words, "tracker-missing"))
+            out.append(Issue(words, "tracker-missing"))
         if len(triads) == 1 and not self.measures_deceleration:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
             words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
             if triads == ["accelerometer"]:
                 words += ', or write model = "ballistic" in [motion], where an accelerometer measures the drag'
-            out.append(Fault(words, "inertial-missing"))
+            out.append(Issue(words, "inertial-missing"))
         if self.motion.model == "strapdown" and not triads:
             words = (
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
-            out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
+            out.append(Issue(f'motion.model = "strapdown" {words}', "inertial-missing"))
         attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
         if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
             words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
-            out.append(Fault(f"{words}; take [start] out", "rest-without-inertial"))
+            out.append(Issue(f"{words}; take [start] out", "rest-without-inertial"))
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
             words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
-            out.append(Fault(words, "attitude-missing"))
+            out.append(Issue(words, "attitude-missing"))
         return out
 
 
@@ -466,7 +465,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
-        gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
+        gate.findings.append(Issue(words, "inertial-unused", "motion"))
     measured = spec.atmosphere is not None
     place = _first_place(radars, gnss, spec.body, state)
     barometers = {
@@ -564,14 +563,14 @@ def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
         vehicle = vehicle_from_toml(path).with_events((event.name, event.t_s) for event in events)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"vehicle: {each}", each.code))
+            gate.refuse_config(Issue(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
         use, code = "the camera's fit is of its edge and surface", "mesh-fitted"
         if body == "centerbody":
             use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-drawn"
         code = "mesh-apart" if mesh.apart else code
-        gate.findings.append(Finding(f"mesh of the {body}", f"{mesh.words}; {use}", np.nan, np.nan, code))
+        gate.findings.append(Issue(f"{mesh.words}; {use}", code, f"mesh of the {body}"))
     return vehicle
 
 
@@ -590,13 +589,13 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
         return read_sounding(gate, spec.atmosphere, spec.body)
     if spec.body != WGS84:
         words = f"no [atmosphere]: the standard atmosphere of {spec.planet.capitalize()} without wind stands for it"
-        gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+        gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
         return standard_sounding(spec.body)
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 stands for it, density to 10 % (24 % from 80 km), "
         "wind to 15 m/s"
     )
-    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+    gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
     return standard_sounding()
 
 
@@ -632,7 +631,7 @@ def _state(gate: Gate, spec: FlightFile) -> StatePrior | None:
         return spec.start.state.prior(spec.t0_utc, spec.body)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"start.state: {each}", each.code))
+            gate.refuse_config(Issue(f"start.state: {each}", each.code))
         return None
 
 
@@ -641,7 +640,7 @@ def _start(entry: StartEntry) -> Start:
     return Start(entry.at_rest, entry.sd_mps, azimuth, float(np.deg2rad(entry.azimuth_sd_deg)))
 
 
-def _rest_findings(telemetry: Telemetry) -> list[Finding]:
+def _rest_findings(telemetry: Telemetry) -> list[Issue]:
     """A rest that the data begin with and flight.toml does not state."""
     if telemetry.motion.model != "strapdown" or telemetry.start.at_rest is not None:
         return []
@@ -655,13 +654,13 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
         f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
         f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     )
-    out = [Finding("start", words, *span, code="rest-found")]
+    out = [Issue(words, "rest-found", "start", *span)]
     rates = telemetry.rates
     turning = float(np.abs(mean_readings(rates, span).mean).max()) - telemetry.planet.rate_radps
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
         words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
-        out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
+        out.append(Issue(words, "bias-beyond-data-sheet", rates.spec.name, *span))
     return out
 
 

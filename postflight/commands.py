@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.camera import Lens
-from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
@@ -265,7 +265,7 @@ def _answered(
     answers = estimate(bet, wanted, step(0.7, 1.0), camera, second.time_bias)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
-        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+        answers.refused["camera"] = Issue("the flight has no video", NO_VIDEO)
     return bet, answers
 
 
@@ -317,7 +317,7 @@ def asked(
 ) -> Asked:
     """Read ``--set NAME=VALUE`` (the value as TOML writes it) and the other options; every fault at once."""
     changes: dict[str, Any] = {}
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     if run_name is not None:
         try:
             check_name(run_name)
@@ -326,9 +326,9 @@ def asked(
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and name):
-            faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+            faults.append(Issue(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
         elif name in changes:
-            faults.append(Fault(f"--set {text}: {name} is set twice; give it once", "set-twice"))
+            faults.append(Issue(f"--set {text}: {name} is set twice; give it once", "set-twice"))
         else:
             changes[name] = _toml_value(value)
     if faults:
@@ -492,7 +492,7 @@ def deflection(
         except (GateError, DivergenceError) as fault:
             if not alone:
                 raise
-            trouble = Fault(str(fault), fault.codes[0])
+            trouble = Issue(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
             run_folder.write_answers(out, answers)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type, part_of
+from flightmodel.checks import FloatArray, GateError, Issue, Progress, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
@@ -38,7 +38,7 @@ class Deflections(Tabular):
     ----------
     histories : dict of DeflectionHistory
         By method: ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"``.
-    refused : dict of Fault
+    refused : dict of Issue
         Why a method gave none.
     fused : FusedAnswer or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
@@ -48,22 +48,22 @@ class Deflections(Tabular):
         What they were made from; None where the camera answered without a trajectory.
     increments : AeroIncrements or None
         Of the aerodynamic coefficients, where they were asked for (`with_increments`); ``no_increments`` says why not.
-    no_increments : Fault or None
+    no_increments : Issue or None
     """
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
-    refused: dict[str, Fault] = field(default_factory=dict)
+    refused: dict[str, Issue] = field(default_factory=dict)
     fused: FusedAnswer | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
     increments: AeroIncrements | None = field(default=None, compare=False)
-    no_increments: Fault | None = None
+    no_increments: Issue | None = None
 
     @property
     def history(self) -> DeflectionHistory:
         """The fused history; `GateError` with the reason where there is none."""
         if "fused" not in self.histories:
-            reason = self.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))
+            reason = self.refused.get("fused", Issue("the fused deflection was not asked for", "fused-missing"))
             raise GateError([reason])
         return self.histories["fused"]
 
@@ -175,13 +175,13 @@ def borne_out(check: ConsistencyCheck, agreement: Agreement) -> ConsistencyCheck
     return replace(check, high=check.value, passed=True, remark=words)
 
 
-def no_answer_at(history: DeflectionHistory, at_s: float) -> Fault:
+def no_answer_at(history: DeflectionHistory, at_s: float) -> Issue:
     """Why a history with answers has none at a time, which lies outside them or in a gap."""
     known = history.time_s[np.isfinite(history.theta_rad)]
     first, last = float(known[0]), float(known[-1])
     where = "a gap" if first < at_s < last else "the data begin" if at_s <= first else "the data end"
     words = f"no answer at {at_s:.2f} s: {where}; answers span {first:.2f} to {last:.2f} s"
-    return Fault(words, "no-answer")
+    return Issue(words, "no-answer")
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
@@ -319,16 +319,16 @@ def estimate(
                 )
                 history = fused.fused.history
         except GateError as fault:
-            answers.refused[method] = Fault(str(fault), fault.codes[0])
+            answers.refused[method] = Issue(str(fault), fault.codes[0])
             continue
         answered = np.isfinite(history.theta_rad)
         if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
-            answers.refused[method] = Fault(words, "camera-no-frame")
+            answers.refused[method] = Issue(words, "camera-no-frame")
         elif answered.any():
             answers.histories[method] = history
         else:
-            answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
+            answers.refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
     histories = {m: answers.histories[m] for m in methods if m in answers.histories}
     refused = {m: answers.refused[m] for m in methods if m in answers.refused}
@@ -345,7 +345,7 @@ def with_increments(answers: Deflections) -> Deflections:
     try:
         return replace(answers, increments=_increments(answers.fused, answers.bet))
     except GateError as fault:
-        return replace(answers, no_increments=Fault(str(fault), fault.codes[0]))
+        return replace(answers, no_increments=Issue(str(fault), fault.codes[0]))
 
 
 @on_one_thread
@@ -369,7 +369,7 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     if found.bet is not bet:
         raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "answers-of-another")
     if found.fused is None:
-        raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
+        raise GateError([found.refused.get("fused", Issue("the fused deflection was not asked for", "fused-missing"))])
     return _increments(found.fused, bet)
 
 

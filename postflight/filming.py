@@ -22,7 +22,7 @@ from estimators.frame_edits import edited
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
 from estimators.unloaded_frames import Rest, rest_of
-from flightmodel.checks import DivergenceError, Fault, GateError, Progress, part_of
+from flightmodel.checks import DivergenceError, GateError, Issue, Progress, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
@@ -55,7 +55,7 @@ class CameraAnswer:
         What became of every frame: ``camera`` and the columns of `FilmFit.frame_table`.
     joined : JoinedCameras or None
         None of one camera alone.
-    refused : dict of Fault
+    refused : dict of Issue
         Cameras whose film cannot be used, and why.
     benchmarks_s : tuple of float
         Times of the benchmark frames.
@@ -65,7 +65,7 @@ class CameraAnswer:
         Of each camera whose film can tell: whether its benchmark frame is one at rest.
     plane : PlaneTest or None
         Whether the film bears out the plane that is assumed.
-    unfounded : dict of Fault
+    unfounded : dict of Issue
         Of each camera, where the vehicle file states features: why its benchmark frame does not show them; empty where
         it does.
     oriented : dict of OrientedCamera
@@ -77,12 +77,12 @@ class CameraAnswer:
     smooth: DeflectionHistory | None
     frames: pd.DataFrame
     joined: JoinedCameras | None
-    refused: dict[str, Fault]
+    refused: dict[str, Issue]
     benchmarks_s: tuple[float, ...]
     shape: ShellShape | None = None
     rests: dict[str, Rest] = field(default_factory=dict)
     plane: PlaneTest | None = None
-    unfounded: dict[str, Fault] = field(default_factory=dict)
+    unfounded: dict[str, Issue] = field(default_factory=dict)
     oriented: dict[str, OrientedCamera] = field(default_factory=dict)
 
     @property
@@ -233,7 +233,7 @@ def camera_answer(
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
     films: dict[str, FilmFit] = {}
-    refused: dict[str, Fault] = {}
+    refused: dict[str, Issue] = {}
     of_flight = flight.telemetry.films
     count = len(of_flight)
     # one after the other: in threads they take as long, for each holds the interpreter most of the time
@@ -242,9 +242,9 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
         try:
             films[name] = camera_film(flight, frames, shown)
         except GateError as fault:
-            refused[name] = Fault(str(fault), fault.codes[0])
+            refused[name] = Issue(str(fault), fault.codes[0])
     if not films:
-        raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
+        raise GateError([Issue(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
     films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
     plain, corrected, tables, remarks = [], [], [], []
     rests: dict[str, Rest] = {}
@@ -267,7 +267,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     known = any(one is not two for one, two in zip(corrected, plain, strict=True))
     at_plain = join_cameras(plain, hz) if known else joined
     unused = {one.name for one in plain} - {one.name for one in joined.readings}
-    refused |= {name: Fault("too few frames with an answer", "too-few-readings") for name in unused}
+    refused |= {name: Issue("too few frames with an answer", "too-few-readings") for name in unused}
     remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
     words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
@@ -316,7 +316,7 @@ def _benchmark(
         return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
 
 
-def _unfounded(films: dict[str, FilmFit], flight: Flight) -> dict[str, Fault]:
+def _unfounded(films: dict[str, FilmFit], flight: Flight) -> dict[str, Issue]:
     """Of each film, where the vehicle file states features: why they are not used, empty where they are."""
     if flight.telemetry.required_vehicle().geometry.features in ("none", "texture"):
         return {}

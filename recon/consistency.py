@@ -37,10 +37,9 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.checks import BoolArray, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding
 from recon._measurement_kernels import DECELERATION, RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
 from recon.measurements import REST, SLOT_NAMES
@@ -276,7 +275,7 @@ def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings
     return out
 
 
-def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Issue]:
     """Say which trackers, left out by the settings, are not where the others predict them: either may be wrong."""
     found = []
     owners = {instrument.name: instrument.owner for instrument in problem.instruments}
@@ -292,7 +291,7 @@ def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settin
             f"{abs(rows.residual[worst]) / rows.predicted_sd[worst]:.1f} sd at {rows.time_s[worst]:.1f} s: it "
             "disagrees with the trajectory, and either may be wrong"
         )
-        found.append(Finding(str(source), words, float(times.min()), float(times.max()), "left-out-disagrees"))
+        found.append(Issue(words, "left-out-disagrees", str(source), float(times.min()), float(times.max())))
     return found
 
 
@@ -509,12 +508,12 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     )
 
 
-def point_findings(problem: Problem, accepted: BoolArray, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+def point_findings(problem: Problem, accepted: BoolArray, held_out: pd.DataFrame, settings: Settings) -> list[Issue]:
     """Findings on measurements that were edited, and on trackers that are left out."""
     return edit_findings(problem, accepted) + left_out_findings(problem, held_out, settings)
 
 
-def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
+def edit_findings(problem: Problem, accepted: BoolArray) -> list[Issue]:
     """Stretches in which measurements were edited; sources excluded by settings have none."""
     out = []
     time_s = problem.time_s[problem.node]
@@ -528,9 +527,9 @@ def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
         if len(stretches) > _MOST_STRETCHES:
             share = 100.0 * len(times) / int(mine.sum())
             remark = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
-            out.append(Finding(instrument.name, remark, float(times[0]), float(times[-1]), "points-edited"))
+            out.append(Issue(remark, "points-edited", instrument.name, float(times[0]), float(times[-1])))
             continue
         for stretch in stretches:
             remark = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
-            out.append(Finding(instrument.name, remark, float(stretch[0]), float(stretch[-1]), "points-edited"))
+            out.append(Issue(remark, "points-edited", instrument.name, float(stretch[0]), float(stretch[-1])))
     return out

@@ -43,8 +43,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, IntArray
-from flightmodel.telemetry import Finding
+from flightmodel.checks import DivergenceError, FloatArray, IntArray, Issue
 from recon import _glr_kernels
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Innovations, Problem
@@ -121,14 +120,14 @@ class UnmodelledAcceleration:
     end_s: float
     density: float
 
-    def finding(self) -> Finding:
+    def finding(self) -> Issue:
         """Finding that names its size."""
         gained = np.sqrt(self.density * (self.end_s - self.start_s))
         remark = (
             f"unmodelled acceleration: about {gained:.2g} m/s of velocity along each axis that neither sensors nor the "
             "motion model explain; check for staging, thrust, a parachute or a saturated sensor"
         )
-        return Finding("motion", remark, self.start_s, self.end_s, UNMODELLED_CODE)
+        return Issue(remark, UNMODELLED_CODE, "motion", self.start_s, self.end_s)
 
 
 def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> ConsistencyCheck:

@@ -38,9 +38,9 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray, GateError, Progress
+from flightmodel.checks import FloatArray, GateError, Issue, Progress
 from flightmodel.earth import WGS84, name_of
-from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
     consistency,
@@ -115,7 +115,7 @@ class TrajectorySolution:
         Rotation and specific force error per unit normal of the accelerometer's errors, `accelerometer_root`.
     triad_root : (n, 9, 18) float
         Rotation, specific force and rate error per unit normal of both triads' errors, `triad_root`.
-    findings : tuple of Finding
+    findings : tuple of Issue
         Gaps that were bridged, stretches of radar track that were edited, and so on.
     provenance : dict
     left_out : tuple of LeftOut
@@ -141,7 +141,7 @@ class TrajectorySolution:
     rate_cov: FloatArray
     accelerometer_root: FloatArray
     triad_root: FloatArray
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
     adaptation: Adaptation = NO_ADAPTATION
@@ -270,7 +270,7 @@ def _with_corrected_clock(
     known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
     again = reconstruct_once(one.telemetry, settings, adaptation=known)
     start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
-    finding = Finding(name, f"{one.words.partition(': ')[2]}: corrected", start_s, end_s, "clock-corrected")
+    finding = Issue(f"{one.words.partition(': ')[2]}: corrected", "clock-corrected", name, start_s, end_s)
     failed = tuple(replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag")
     checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
     return one.telemetry, replace(again, consistency_checks=checks, findings=(*again.findings, finding))
@@ -579,7 +579,7 @@ def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting
     return Mounting(telemetry.t0_utc, arm, sensors.rate)
 
 
-def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Finding]:
+def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Issue]:
     """What the inertial sensors' samples show by themselves."""
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if telemetry.drag_accelerometer is not None:

@@ -26,8 +26,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import AttitudePrior, Finding, RestReadings, Telemetry, TriadRecord, mean_readings
+from flightmodel.checks import FloatArray, GateError, Issue
+from flightmodel.telemetry import AttitudePrior, RestReadings, Telemetry, TriadRecord, mean_readings
 from recon._measurement_kernels import FIELD, VELOCITY
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.measurements import REST, Instrument, instrument_of
@@ -197,7 +197,7 @@ def inflated_priors(telemetry: Telemetry, checks: list[ConsistencyCheck], times:
     return out
 
 
-def noise_findings(telemetry: Telemetry) -> list[Finding]:
+def noise_findings(telemetry: Telemetry) -> list[Issue]:
     """Noise at rest where it differs from the data sheet's by more than half, as a proposal for it."""
     span, out = telemetry.start.at_rest, []
     if span is None:
@@ -211,5 +211,5 @@ def noise_findings(telemetry: Telemetry) -> list[Finding]:
         if not 1.0 / _NOISE_FACTOR < found / stated < _NOISE_FACTOR:
             words = f"noise at rest is {factor * found:.3g} {unit}, stated is {factor * stated:.3g}"
             words += ": proposed for the data sheet where the flight shakes no more"
-            out.append(Finding(record.spec.name, words, *span, code="noise-at-rest"))
+            out.append(Issue(words, "noise-at-rest", record.spec.name, *span))
     return out

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.checks import ConfigError, Issue, nearest_name
 
 COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.ekf` and `recon.smoother`
 _SYNONYMS = {"readable": FILTERPY}  # of an engine
@@ -166,7 +166,7 @@ class Settings:
             except (TypeError, ValueError) as wrong:
                 shown = f"'{value}'" if isinstance(value, str) else f"{value}"
                 hint = str(wrong) if rule["code"] == "setting-choice" else ""
-                faults.append(Fault(f"{setting.name} {shown}{hint} must be {rule['allowed']}", rule["code"]))
+                faults.append(Issue(f"{setting.name} {shown}{hint} must be {rule['allowed']}", rule["code"]))
         if faults:
             raise ConfigError(faults)
 
@@ -181,7 +181,7 @@ class Settings:
         """
         names = [setting.name for setting in fields(cls)]
         faults = [
-            Fault(
+            Issue(
                 f"[reconstruction] {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
                 "setting-unknown",
             )
@@ -191,7 +191,7 @@ class Settings:
         try:
             chosen = cls(**{key: value for key, value in values.items() if key in names})  # type: ignore[arg-type]
         except ConfigError as wrong:
-            faults += [Fault(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
+            faults += [Issue(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
         if faults:
             raise ConfigError(faults)
         return chosen

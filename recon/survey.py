@@ -23,9 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, Issue
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding, KnownPlace, Telemetry
+from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
 from recon.ekf import ForwardPass, Problem
@@ -191,13 +191,13 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
     )  # fmt: skip
 
 
-def unchecked_state(telemetry: Telemetry) -> list[Finding]:
+def unchecked_state(telemetry: Telemetry) -> list[Issue]:
     """Finding where a flight without a tracker states no place: then nothing checks where it flew."""
     state = telemetry.start.state
     if state is None or telemetry.radars or telemetry.gnss or telemetry.places:
         return []
     words = "no tracker and no [[places]]: nothing checks this state, its time and axes; state where the vehicle landed"
-    return [Finding("start", words, state.time_s, state.time_s, "state-unchecked")]
+    return [Issue(words, "state-unchecked", "start", state.time_s, state.time_s)]
 
 
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:

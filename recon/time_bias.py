@@ -28,9 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, FloatArray, Issue
 from flightmodel.statistics import NORMAL_MAD
-from flightmodel.telemetry import Finding, TriadRecord
+from flightmodel.telemetry import TriadRecord
 from flightmodel.trajectory import interpolate_rows
 from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Problem
@@ -223,14 +223,14 @@ def with_corrected_tags(record: TriadRecord, sensor: int, jumps: tuple[ClockJump
     return replace(record, time_s=t)
 
 
-def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Finding]:
+def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Issue]:
     """One finding for each sensor and jump."""
     out = []
     for jump in jumps:
         remark = f"time tags jump {1e3 * jump.by_s:.1f} ms ahead while no sample is missing: those "
         remark += "after it were set back" if jump.after else "before it were set forward"
         span = jump.at_s - 0.5 * jump.by_s, jump.at_s + 0.5 * jump.by_s
-        out += [Finding(names[sensor], remark, *span, "clock-jump") for sensor in jump.sensors]
+        out += [Issue(remark, "clock-jump", names[sensor], *span) for sensor in jump.sensors]
     return out
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, check_type, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     Duration,
@@ -236,7 +236,7 @@ def read_scenario(name: str | Path) -> Scenario:
     path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
     tables = read_toml(path)
     spec, vehicle = None, None
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     try:
         spec = parse_section(ScenarioFile, tables, str(path))
     except ConfigError as fault:
@@ -255,7 +255,7 @@ def read_scenario(name: str | Path) -> Scenario:
     raise ConfigError(faults)
 
 
-def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fault]:
+def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Issue]:
     """Return which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
     packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
     faults = []
@@ -267,7 +267,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fa
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
             message = f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}"
-            faults.append(Fault(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
+            faults.append(Issue(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
     return faults
 
 

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from benchmarks.golden_numbers import kept, sd_column
 
 from benchmarks import golden, golden_flights
-from benchmarks.golden_numbers import kept, sd_column
 
 ROWS = 500
 

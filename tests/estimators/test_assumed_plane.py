@@ -9,7 +9,7 @@ from estimators.assumed_plane import plane_test
 from estimators.camera import read_film
 from estimators.edge import no_horizon
 from estimators.frame_solution import refused_fit
-from flightmodel.checks import Fault
+from flightmodel.checks import Issue
 from flightmodel.deflection import DeflectionHistory
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D, film
 
@@ -48,7 +48,7 @@ def test_a_plane_across_or_opposite_fails(frames, off_deg):
 def test_without_a_plane_or_an_answer_there_is_nothing_to_test(frames):
     read = in_plane(frames, TRUE_DEG)
     assert plane_test(replace(read, plane_lv_rad=None)) is None
-    nothing = refused_fit(no_horizon(Fault("dark", "frame-dark")), Fault("dark", "frame-dark"))
+    nothing = refused_fit(no_horizon(Issue("dark", "frame-dark")), Issue("dark", "frame-dark"))
     assert plane_test(replace(read, fits=(nothing,) * 3)) is None
 
 

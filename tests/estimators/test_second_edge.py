@@ -8,11 +8,11 @@ import pytest
 
 from estimators.benchmark import orient_camera
 from estimators.camera import read_film, without_mixed
-from estimators.edge import LIKE_DOUBLED, NO_FAULT, no_horizon, second_edge
+from estimators.edge import LIKE_DOUBLED, no_horizon, second_edge
 from estimators.frame_residuals import edge_residuals
 from estimators.frame_solution import refused_fit
 from estimators.virtual_camera import DEFLECTION, RADIUS
-from flightmodel.checks import Fault
+from flightmodel.checks import NO_FAULT, Issue
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 from tests.estimators.test_other_film import answers
 from tests.estimators.test_spoilt_film import CONTRADICTS
@@ -86,7 +86,7 @@ def test_a_film_of_mixed_pictures_is_no_film(frames):
 
 def test_one_doubled_frame_of_a_long_film_is_its_own_fault():
     fits = answers(np.linspace(1.0, 2.0, 60))
-    doubled = refused_fit(no_horizon(Fault("no", "picture-doubled")), Fault("no", "picture-doubled"))
+    doubled = refused_fit(no_horizon(Issue("no", "picture-doubled")), Issue("no", "picture-doubled"))
     assert sum(bool(f.refused) for f in without_mixed([doubled, *fits])) == 1
     assert sum(bool(f.refused) for f in without_mixed([doubled] * 2 + fits)) == 2
     assert sum(bool(f.refused) for f in without_mixed([doubled] * 5 + fits)) == 5

@@ -8,7 +8,7 @@ import pytest
 from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
 from estimators.fusion import fuse
-from flightmodel.checks import DivergenceError, Fault
+from flightmodel.checks import DivergenceError, Issue
 from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
 from postflight import fusing
 from postflight.deflections import Deflections, borne_out, quantiles_at
@@ -174,12 +174,12 @@ def test_quantiles_between_frames_are_as_wide_as_the_sd():
 
 
 def test_a_refused_fusion_is_a_red_check():
-    refused = Deflections(refused={"fused": Fault("no common answer", "fusion-not-converged")})
+    refused = Deflections(refused={"fused": Issue("no common answer", "fusion-not-converged")})
     (check,) = refused.consistency_checks
     assert not check.passed
     assert check.code == "deflection-methods"
     # one that has nothing to say is none
-    assert Deflections(refused={"fused": Fault("no vehicle", "vehicle-missing")}).consistency_checks == ()
+    assert Deflections(refused={"fused": Issue("no vehicle", "vehicle-missing")}).consistency_checks == ()
     assert Deflections().consistency_checks == ()
 
 
