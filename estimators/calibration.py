@@ -102,7 +102,7 @@ def read_corners(path: Path) -> pd.DataFrame:
         found = ", ".join(table.columns)
         hints = [f"no column '{c}'{nearest_name(c, list(table.columns))}; found {found}" for c in missing]
         raise GateError([f"{label}: {path}: line 1: {hint}" for hint in hints], code="table-column-missing")
-    faults: list[str] = []
+    faults: list[Issue] = []
     values = {c: tables.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
     for c, column in values.items():
         if not faults and np.isnan(column).any():

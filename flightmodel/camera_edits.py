@@ -163,7 +163,7 @@ def read_edits(
     if missing:
         hints = [f"no column '{c}'{nearest_name(c, list(frame.columns))}" for c in missing]
         raise GateError([f"{_LABEL}: {path}: line 1: {hint}" for hint in hints], code="table-column-missing")
-    faults: list[str] = []
+    faults: list[Issue] = []
     t, u, v, value = (tables.numbers(frame, c, path, _LABEL, faults) for c in ("t_s", "u_px", "v_px", "value"))
     if faults:
         raise GateError(faults)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from math import isfinite, nan
 from numbers import Integral
 from pathlib import Path
@@ -79,6 +80,51 @@ class Issue(str):
 
 
 NO_FAULT = Issue("")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statistic, the band it should lie in, whether it does, and what follows.
+
+    Parameters
+    ----------
+    code : str
+        Short and stable: ``"nis"``, ``"whiteness"``, ...
+    name : str
+        The statistic and what it is of.
+    value, low, high : float
+    passed : bool
+    remark : str
+        What was found and, where the check failed, what that means and what to check.
+    source : str
+        Tracker or sensor that it is about; empty where it is about the flight.
+    component : str
+        Component or error of that source that it is about.
+    symptom : str
+        What was found, without what follows.
+    """
+
+    code: str
+    name: str
+    value: float
+    low: float
+    high: float
+    passed: bool
+    remark: str
+    source: str = ""
+    component: str = ""
+    symptom: str = ""
+
+    @classmethod
+    def of(
+        cls, code: str, name: str, value: float, low: float, high: float, good: str, bad: str,
+        *, advice: str = "", source: str = "", component: str = "",
+    ) -> Check:  # fmt: skip
+        """Check with the symptom that fits, ``good`` or ``bad``; ``advice`` follows where it failed."""
+        passed = bool(low <= value <= high)
+        symptom = good if passed else bad
+        remark = f"{symptom}: {advice}" if advice and not passed else symptom
+        return cls(code, name, float(value), float(low), float(high), passed, remark, source, component, symptom)
 
 
 class GateError(ValueError):

@@ -56,7 +56,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     if missing:
         hints = "; ".join(f"no column '{name}'{nearest_name(name, list(frame.columns))}" for name in missing)
         raise GateError(f"{label}: {path}: {hints}; wanted are {', '.join(COLUMNS)}", code="column-missing")
-    faults: list[str] = []
+    faults: list[Issue] = []
     station, radius, clock, width = (numbers(frame, name, path, label, faults) for name in NUMBERS)
     kind = _words(frame, "kind", FEATURE_KINDS, path, faults)
     shade = _words(frame, "shade", SHADES, path, faults)
@@ -84,7 +84,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
 
 
 def _words(
-    frame: pd.DataFrame, column: str, known: tuple[str, ...], path: Path, faults: list[str]
+    frame: pd.DataFrame, column: str, known: tuple[str, ...], path: Path, faults: list[Issue]
 ) -> NDArray[np.int64]:
     """Index of each cell's word among the known ones."""
     cells = frame[column].str.strip()

@@ -522,7 +522,7 @@ def column_si(
     return to_si(numbers(frame, column, path, label, faults), unit)
 
 
-def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
+def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> Issue:
     stem = column.rsplit("_", 1)[0]
     bare = [c for c in frame.columns if c.lower() in (stem.lower(), quantity.short.lower())]
     if bare:

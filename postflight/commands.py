@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.camera import Lens
-from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
+from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
@@ -33,7 +33,6 @@ from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import return_large_arrays, write_out
 from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.terminal import few_of_each, progress_bar, terminal
-from recon.consistency import ConsistencyCheck
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -375,7 +374,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         console.coded(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
 
 
-def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
+def print_checks(checks: tuple[Check, ...], of: str) -> None:
     """Print how many checks of something pass, and in red those that fail."""
     failed = [check for check in checks if not check.passed]
     console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import FloatArray, GateError, Issue, Progress, check_type, part_of
+from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
-from recon.consistency import ConsistencyCheck, doubt
+from recon.consistency import doubt
 
 if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
     from estimators.agreement import Agreement
@@ -106,7 +106,7 @@ class Deflections(Tabular):
         return None if self.best is None else cycle_about(self.continuous[self.best], self.reference_s)
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether cameras agree, methods do, they have a common answer, and coefficients are as stated."""
         of_cameras = () if self.camera is None else self.camera.consistency_checks
         if self.fused is not None:
@@ -117,7 +117,7 @@ class Deflections(Tabular):
         if reason is None or reason.code not in NO_COMMON_ANSWER:
             return of_cameras
         name, words = "deflection methods have a common answer", str(reason)
-        return (*of_cameras, ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
+        return (*of_cameras, Check("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
 
     @property
     def doubt(self) -> str:
@@ -166,7 +166,7 @@ class Deflections(Tabular):
         return f"{self.doubt}; {answers}" if self.doubt else answers
 
 
-def borne_out(check: ConsistencyCheck, agreement: Agreement) -> ConsistencyCheck:
+def borne_out(check: Check, agreement: Agreement) -> Check:
     """Check of a camera: features that its film lacks are no fault where the inertial methods agree with its answer."""
     compared = [pair for pair in agreement.pairs if "camera" in pair.methods]
     if check.passed or check.code != "camera-features" or not compared or agreement.hypotheses:

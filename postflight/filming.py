@@ -22,7 +22,7 @@ from estimators.frame_edits import edited
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
 from estimators.unloaded_frames import Rest, rest_of
-from flightmodel.checks import DivergenceError, GateError, Issue, Progress, part_of
+from flightmodel.checks import Check, DivergenceError, GateError, Issue, Progress, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
@@ -31,7 +31,6 @@ from flightmodel.vehicle import Vehicle
 from postflight.flight import NO_VIDEO, Flight
 from postflight.fusing import CAMERA_PLANE_SD_RAD
 from postflight.reconstruction import Reconstruction
-from recon.consistency import ConsistencyCheck
 
 _SAME_FRAME_S = 1e-3
 # cameras that were oriented last, of which a run's pictures ask several times; as many as flights have
@@ -92,10 +91,10 @@ class CameraAnswer:
         return len(answered) > 0 and bool(np.isin(answered, self.benchmarks_s).all())
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether each camera's shell rests without load, and in the assumed plane; whether several cameras agree."""
         checks = [
-            ConsistencyCheck(
+            Check(
                 "camera-rest", f"{name}: deflection without load over its sd", rest.over_sd, 0.0, rest.limit,
                 rest.passed, f"{name}: {rest.remark}", "camera" if self.joined is None else name,
             )
@@ -109,24 +108,22 @@ class CameraAnswer:
                     'and lens of the vehicle file and that the frame is one at rest, or state features = "texture"'
                 )
             source, name = "camera" if self.joined is None else camera, f"{camera}: stated features not found"
-            checks.append(ConsistencyCheck("camera-features", name, float(bool(why)), 0.0, 0.0, not why, words, source))
+            checks.append(Check("camera-features", name, float(bool(why)), 0.0, 0.0, not why, words, source))
         if self.plane is not None:
             name, of = "deflection that the assumed plane leaves out, over its sd", self.plane
-            checks.append(
-                ConsistencyCheck("camera-plane", name, of.over_sd, 0.0, LIMIT_SD, of.passed, of.remark, "camera")
-            )
+            checks.append(Check("camera-plane", name, of.over_sd, 0.0, LIMIT_SD, of.passed, of.remark, "camera"))
         if self.joined is None:
             return tuple(checks)
         if self.joined.tests:
             least = min(test.p_value for test in self.joined.tests)
             name, low = "cameras agree: least chance of a test", 1.0 - CONFIDENCE
             one = self.joined
-            checks.append(ConsistencyCheck("cameras", name, least, low, 1.0, one.agree, one.remark, one.suspect))
+            checks.append(Check("cameras", name, least, low, 1.0, one.agree, one.remark, one.suspect))
         words = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "every camera has an answer"
         count = float(len(self.refused))
         source = ", ".join(self.refused)
         name = "cameras without an answer"
-        return (*checks, ConsistencyCheck("camera-refused", name, count, 0.0, 0.0, not self.refused, words, source))
+        return (*checks, Check("camera-refused", name, count, 0.0, 0.0, not self.refused, words, source))
 
 
 def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress | None = None) -> FilmFit:

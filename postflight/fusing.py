@@ -38,9 +38,8 @@ from estimators.loads import MIN_AXIAL_MPS2, FlightLoads
 from estimators.misalignment import estimate_misalignment, misalignment_evidence
 from estimators.southwell import Limbs, southwell_limbs
 from estimators.trim import estimate_trim, trim_evidence
-from flightmodel.checks import DivergenceError, FloatArray, GateError
+from flightmodel.checks import Check, DivergenceError, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
-from recon.consistency import ConsistencyCheck
 
 _METHODS: dict[str, Method] = {"misalignment": misalignment_evidence, "trim": trim_evidence}
 _FREED = 10.0  # times its stated sd an input is as good as unknown: a fault of two stated sd is a fifth of it
@@ -119,7 +118,7 @@ class FusedAnswer:
         return words
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether the methods agree, and whether the camera's time bias is what is stated.
 
         A time bias that is off comes first: what else the agreement suspects supposes that the frames' times are right.
@@ -133,13 +132,11 @@ class FusedAnswer:
         blamed = "camera" if is_late or self.left_out == "camera" else ", ".join(likeliest) or self.left_out or ""
         source = "" if passed else blamed
         name = "deflection methods agree: least chance of a pair"
-        checks = [
-            ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)
-        ]
+        checks = [Check("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)]
         if bias is not None and not bias.applied:
             size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
             name = "camera time bias over its sd"
-            clock = ConsistencyCheck("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
+            clock = Check("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
             checks.insert(0 if bias.is_off else 1, clock)
         return tuple(checks)
 

@@ -31,7 +31,7 @@ from estimators.trim import SLOPE_AT_RAD
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
-from flightmodel.checks import BoolArray, DivergenceError, FloatArray, GateError, Issue, Progress, check_type
+from flightmodel.checks import BoolArray, Check, DivergenceError, FloatArray, GateError, Issue, Progress, check_type
 from flightmodel.events import find_peak
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
@@ -51,7 +51,7 @@ from recon.atmosphere import (
     too_sparse,
     windows_are_whole,
 )
-from recon.consistency import ConsistencyCheck, doubt
+from recon.consistency import doubt
 from recon.entry_density import (
     density_by_drag,
     density_check,
@@ -156,7 +156,7 @@ class Reconstruction(Tabular):
         Comparison with an attitude from magnetometer and Sun sensors alone.
     density : DataFrame or None
         Air by the deceleration with the drag of [drag], `recon.entry_density`.
-    density_checks : tuple of ConsistencyCheck
+    density_checks : tuple of Check
         Of that density against the stated atmosphere's.
     clocks : tuple of Issue
         Time tags that are off by tracks against inertial sensors; looked for where a check fails.
@@ -171,7 +171,7 @@ class Reconstruction(Tabular):
     missing: tuple[Issue, ...] = ()
     attitude: AttitudeCheck | None = None
     density: pd.DataFrame | None = None
-    density_checks: tuple[ConsistencyCheck, ...] = ()
+    density_checks: tuple[Check, ...] = ()
     clocks: tuple[Issue, ...] = ()
 
     @property
@@ -185,7 +185,7 @@ class Reconstruction(Tabular):
         return self.solution.smoothed
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Checks of the trajectory, then of its attitude, then of the atmosphere."""
         attitude, air = (part.consistency_checks if part is not None else () for part in (self.attitude, self.as_flown))
         return self.solution.consistency_checks + attitude + air + self.density_checks
@@ -336,7 +336,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
     stated = profile = profile_from_sounding(telemetry.sounding)
-    density, checks = None, tuple[ConsistencyCheck, ...]()
+    density, checks = None, tuple[Check, ...]()
     if telemetry.drag is not None:
         density = density_by_drag(telemetry, solution.smoothed, solution.drag)
         tests, confidence = (density_check, temperature_check, drag_jump_check), solution.settings.check_confidence
@@ -643,15 +643,15 @@ class AttitudeCheck:
         return "; ".join(part for part in (result, DEPENDENCE[self.dependence]) if part)
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Size of the differences, their share inside three standard deviations, and the sensors' own residuals."""
         if self.comparison is None or self.history is None:
             return ()
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
         high = chi_square_quantile(self.confidence, 3)
         return (
-            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
-            ConsistencyCheck(
+            Check("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
+            Check(
                 "attitude-coverage",
                 "attitude check share inside",
                 inside,
@@ -660,10 +660,7 @@ class AttitudeCheck:
                 inside >= LEAST_INSIDE,
                 self.remark,
             ),
-            *(
-                ConsistencyCheck(**{**vars(v), "name": f"attitude check {v.name}"})
-                for v in self.history.consistency_checks
-            ),
+            *(Check(**{**vars(v), "name": f"attitude check {v.name}"}) for v in self.history.consistency_checks),
         )
 
 

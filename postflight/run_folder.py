@@ -31,7 +31,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import events
-from flightmodel.checks import DivergenceError, FloatArray, GateError, Issue
+from flightmodel.checks import Check, DivergenceError, FloatArray, GateError, Issue
 from flightmodel.deflection import mean_over
 from flightmodel.earth import WGS84, name_of
 from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write_file, writing
@@ -40,7 +40,6 @@ from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections, no_answer_at, quantiles_at
 from postflight.flight import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
-from recon.consistency import ConsistencyCheck
 from recon.measurements import component_unit
 
 DIGITS = "%.10g"
@@ -332,9 +331,9 @@ def write_all_checks(run: RunFolder, flight: Reconstruction, answers: Deflection
     )
 
 
-def write_checks(run: RunFolder, checks: Iterable[ConsistencyCheck]) -> pd.DataFrame:
+def write_checks(run: RunFolder, checks: Iterable[Check]) -> pd.DataFrame:
     """Write ``consistency_checks.csv``, and return it."""
-    table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(ConsistencyCheck)])
+    table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(Check)])
     run.write_csv("consistency_checks.csv", table)
     return table
 

@@ -33,11 +33,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import BoolArray, FloatArray, GateError, Issue
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
-from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, beyond_gate, edit_check
+from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, beyond_gate, edit_check
 from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
@@ -70,7 +70,7 @@ class LeftOut:
     Parameters
     ----------
     source : str
-    failed : tuple of ConsistencyCheck or None
+    failed : tuple of Check or None
         None where no trajectory can be made without it.
     distance_m : float
         Largest distance from the solution with all sources.
@@ -83,7 +83,7 @@ class LeftOut:
     """
 
     source: str
-    failed: tuple[ConsistencyCheck, ...] | None
+    failed: tuple[Check, ...] | None
     distance_m: float = 0.0
     inconsistent: bool = False
     start_s: float = float("nan")
@@ -133,17 +133,17 @@ NO_ADAPTATION = Adaptation()
 # ---- leave-one-out comparison of trackers
 
 
-def is_about(check: ConsistencyCheck, source: str) -> bool:
+def is_about(check: Check, source: str) -> bool:
     """Whether a check judges this tracker: its residuals, its edits or its a priori errors."""
     return check.code in _ABOUT_SOURCES and check.source == source and not is_generous(check)
 
 
-def is_generous(check: ConsistencyCheck) -> bool:
+def is_generous(check: Check) -> bool:
     """Whether residuals are smaller than predicted: the stated noise is too large, and no sensor is at fault."""
     return check.code == "nis" and check.value < check.low
 
 
-def any_tracker_fails(checks: tuple[ConsistencyCheck, ...], sources: tuple[str, ...]) -> bool:
+def any_tracker_fails(checks: tuple[Check, ...], sources: tuple[str, ...]) -> bool:
     """Whether any failed check is about a tracker."""
     return any(not v.passed and is_about(v, s) for v in checks for s in sources)
 
@@ -151,7 +151,7 @@ def any_tracker_fails(checks: tuple[ConsistencyCheck, ...], sources: tuple[str, 
 def leave_one_out(
     smoothed: Trajectory,
     sources: tuple[str, ...],
-    rerun: Callable[[str], tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]],
+    rerun: Callable[[str], tuple[Trajectory, tuple[Check, ...], bool]],
 ) -> tuple[tuple[LeftOut, ...], FloatArray]:
     """Result without each source, and what to add to the covariance, (n, 9, 9).
 
@@ -259,8 +259,8 @@ def rejected_points(
 
 
 def edit_checks_with_rejected(
-    checks: tuple[ConsistencyCheck, ...], residuals: pd.DataFrame, rejected: dict[str, FloatArray]
-) -> tuple[ConsistencyCheck, ...]:
+    checks: tuple[Check, ...], residuals: pd.DataFrame, rejected: dict[str, FloatArray]
+) -> tuple[Check, ...]:
     """Checks in which rejected points count as edited."""
     again = {}
     for name, times in rejected.items():
@@ -288,12 +288,12 @@ def rejected_point_findings(rejected: dict[str, FloatArray]) -> list[Issue]:
 # ---- prior inflation
 
 
-def inflated_priors(checks: tuple[ConsistencyCheck, ...], table: pd.DataFrame) -> dict[str, float]:
+def inflated_priors(checks: tuple[Check, ...], table: pd.DataFrame) -> dict[str, float]:
     """Standard deviations to take instead, by name of the error; empty where every data sheet is consistent.
 
     Parameters
     ----------
-    checks : tuple of ConsistencyCheck
+    checks : tuple of Check
     table : DataFrame
         ``name, treated, prior_sd, estimate, sd``.
     """
@@ -351,7 +351,7 @@ def prior_inflation_findings(
 
 
 def isolate_faults(
-    checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
+    checks: tuple[Check, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
 ) -> tuple[Issue, ...]:
     """Fault hypotheses, the most likely first; none where every check passes."""
     failed = [v for v in checks if not v.passed]
@@ -373,7 +373,7 @@ def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[Issue, ...]:
     return (Issue(f"{words}: this one fault explains the data best{odds}", named[0].code, sources),)
 
 
-def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[Issue, ...]:
+def _from_checks(failed: list[Check], left_out: tuple[LeftOut, ...]) -> tuple[Issue, ...]:
     """What the failed checks and the comparison of trackers say."""
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in TRIADS]
     inertial += [v for v in failed if v.code in _ABOUT_BOTH + ABOUT_DECELERATION]
@@ -389,7 +389,7 @@ def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) 
     if any(v.code == "filter-smoother" for v in failed) and not out:
         what = "motion: filter and smoother differ by more than sensor noise and errors explain"
         out.append(Issue(what, "motion"))
-    rest: list[tuple[str, ConsistencyCheck, tuple[str, ...]]] = []
+    rest: list[tuple[str, Check, tuple[str, ...]]] = []
     rest += [("attitude", v, (v.source,)) for v in failed if v.code.startswith("attitude-")]
     of_air = sorted((v for v in failed if v.code in _AIR_SOURCES), key=lambda v: -v.value / v.high)
     rest += [("air", v, _AIR_SOURCES[v.code]) for v in of_air]  # the farthest beyond its limit first
@@ -399,9 +399,7 @@ def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) 
     return (*out, *sentences)
 
 
-def _tracker_hypothesis(
-    failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...], inertial: list[ConsistencyCheck]
-) -> Issue:
+def _tracker_hypothesis(failed: list[Check], left_out: tuple[LeftOut, ...], inertial: list[Check]) -> Issue:
     """Hypothesis from the leave-one-out comparison, where a check about a tracker failed."""
     resolving = [s for s in left_out if s.resolves]
     names = tuple(s.source for s in resolving)
@@ -432,7 +430,7 @@ def _tracker_hypothesis(
     )
 
 
-def _single_tracker_hypothesis(failed: list[ConsistencyCheck]) -> list[Issue]:
+def _single_tracker_hypothesis(failed: list[Check]) -> list[Issue]:
     """What can be concluded where no tracker could be left out."""
     about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in TRIADS)]
     about = [v for v in about if not is_generous(v)]
@@ -442,7 +440,7 @@ def _single_tracker_hypothesis(failed: list[ConsistencyCheck]) -> list[Issue]:
     return [Issue(what, "tracker-or-motion", tuple(dict.fromkeys(v.source for v in about)))]
 
 
-def _inertial(checks: list[ConsistencyCheck]) -> str:
+def _inertial(checks: list[Check]) -> str:
     worst = max(checks, key=lambda v: abs(v.value) / max(v.high, np.finfo(float).tiny))
     if worst.component.startswith("mount"):
         names = " or ".join(f"{v.source} {v.component}" for v in checks if v.component.startswith("mount"))
@@ -452,10 +450,10 @@ def _inertial(checks: list[ConsistencyCheck]) -> str:
     return f"inertial sensors: {worst.remark}"
 
 
-def _inertial_sources(checks: list[ConsistencyCheck]) -> tuple[str, ...]:
+def _inertial_sources(checks: list[Check]) -> tuple[str, ...]:
     names = [name for v in checks for name in ((v.source,) if v.source else TRIADS)]
     return tuple(dict.fromkeys(names))
 
 
-def _symptoms(checks: list[ConsistencyCheck]) -> str:
+def _symptoms(checks: list[Check]) -> str:
     return "; ".join(dict.fromkeys(v.symptom for v in checks))

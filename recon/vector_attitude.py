@@ -25,7 +25,7 @@ import pandas as pd
 from scipy.special import ndtri
 
 from flightmodel import earth, rotations
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, IntArray, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import AttitudePrior, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
@@ -43,7 +43,7 @@ from recon.attitude_smoother import (
     solve_vectors,
     unit,
 )
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.consistency import data_sheet_check
 
 _QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
@@ -91,7 +91,7 @@ class AttitudeHistory:
         Of the body against inertial space, body axes.
     method : str
     findings : tuple of Issue
-    consistency_checks : tuple of ConsistencyCheck
+    consistency_checks : tuple of Check
         Residuals and constant errors of each sensor against its data sheet.
     sensor_errors : DataFrame
         ``name, unit, prior_sd, estimate, sd`` (SI).
@@ -105,7 +105,7 @@ class AttitudeHistory:
     rate_body_radps: FloatArray
     method: str
     findings: tuple[Issue, ...]
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    consistency_checks: tuple[Check, ...]
     sensor_errors: pd.DataFrame
     observations: tuple[VectorObservations, ...]
 
@@ -296,15 +296,15 @@ def _history(
     )
 
 
-def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[ConsistencyCheck]:
+def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Check]:
     """Of each sensor its residuals, and its constant errors against its data sheet."""
 
-    out: list[ConsistencyCheck] = []
+    out: list[Check] = []
     tail = 0.5 * (1.0 - confidence)
     for name, (squares, expected) in fit.misfit.items():
         low, high = (chi_square_quantile(p, expected) / expected for p in (tail, 1.0 - tail))
         out.append(
-            consistency_check(
+            Check.of(
                 "attitude-residuals",
                 f"residuals {name}",
                 squares / expected,

@@ -90,7 +90,7 @@ def read_load_test(
     GateError
         With every fault of the table.
     """
-    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[str]()
+    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[Issue]()
     t = _column(frame, time, ("time",), None, path, faults)
     moment = _column(frame, load, ("force", "moment"), arm_m, path, faults)
     angles = [_column(frame, name, ("length", "angle"), arm_m, path, faults) for name in displacements]
@@ -121,7 +121,7 @@ def read_load_test(
 
 
 def _column(
-    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[str]
+    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[Issue]
 ) -> FloatArray | None:
     """Column in SI; a force or a length with the arm as moment or angle."""
     name, _, unit = asked.partition(":")

@@ -8,12 +8,11 @@ import pytest
 from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
 from estimators.fusion import fuse
-from flightmodel.checks import DivergenceError, Issue
+from flightmodel.checks import Check, DivergenceError, Issue
 from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
 from postflight import fusing
 from postflight.deflections import Deflections, borne_out, quantiles_at
 from postflight.fusing import _mixed, fuse_flight
-from recon.consistency import ConsistencyCheck
 from tests.estimators.conftest import VEHICLE, pulse_of
 
 N = 160
@@ -184,7 +183,7 @@ def test_a_refused_fusion_is_a_red_check():
 
 
 def test_features_that_a_film_lacks_are_no_fault_where_the_inertial_methods_bear_it_out():
-    lacking = ConsistencyCheck("camera-features", "stated features", 1.0, 0.0, 0.0, False, "not found", "camera")
+    lacking = Check("camera-features", "stated features", 1.0, 0.0, 0.0, False, "not found", "camera")
     assert borne_out(lacking, fuse_flight(sound(), film(motion())).agreement).passed
     assert not borne_out(lacking, fuse_flight(sound(), None).agreement).passed
     for spoilt in SPOILT.values():
