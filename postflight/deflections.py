@@ -19,9 +19,9 @@ from recon.consistency import doubt
 
 if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
     from estimators.agreement import Agreement
+    from estimators.fusing import CameraTimeBias, FusedAnswer
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
-    from postflight.fusing import CameraTimeBias, FusedAnswer
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
@@ -307,7 +307,7 @@ def estimate(
             elif method == "trim":
                 history = estimate_trim(bet)
             else:
-                from postflight.fusing import fuse_flight
+                from estimators.fusing import fuse_flight
 
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
@@ -317,7 +317,7 @@ def estimate(
                 fused = fuse_flight(
                     bet.required_loads(), camera, _time_bias_sd_s(flight), tested if used else lambda: None
                 )
-                history = fused.fused.history
+                history = fused.history
         except GateError as fault:
             answers.refused[method] = Issue(str(fault), fault.codes[0])
             continue
@@ -392,13 +392,13 @@ def _time_bias_sd_s(flight: Flight) -> float:
 
 def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> DeflectionHistory | None:
     """Fused deflection alone, without a test of the camera's time bias; None where there is none."""
-    from postflight.fusing import fuse_flight
+    from estimators.fusing import fuse_flight
 
     try:
         answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), lambda: (None,))
     except GateError:
         return None
-    found = answer.fused.history
+    found = answer.history
     return found if np.isfinite(found.theta_rad).any() else None
 
 

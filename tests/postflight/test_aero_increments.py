@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from estimators.fusing import CameraTimeBias, fuse_flight
 from estimators.increments import COEFFICIENTS, STATED
 from flightmodel.aerodynamics import read_with_sidecar, referred_to
 from flightmodel.checks import DivergenceError, GateError, Issue
@@ -16,7 +17,6 @@ from flightmodel.vehicle import DATA, vehicle_from_toml
 from postflight import flown_coefficients
 from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.flown_coefficients import TABLE, increments_of
-from postflight.fusing import CameraTimeBias, fuse_flight
 from postflight.plots.deflection import figure_increments
 from postflight.reconstruction import Reconstruction
 from postflight.run_folder import increments_summary
