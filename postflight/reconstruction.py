@@ -648,19 +648,11 @@ class AttitudeCheck:
         if self.comparison is None or self.history is None:
             return ()
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
-        high = chi_square_quantile(self.confidence, 3)
+        high, name, covers = chi_square_quantile(self.confidence, 3), "attitude check", inside >= LEAST_INSIDE
         return (
-            Check("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
-            Check(
-                "attitude-coverage",
-                "attitude check share inside",
-                inside,
-                LEAST_INSIDE,
-                1.0,
-                inside >= LEAST_INSIDE,
-                self.remark,
-            ),
-            *(Check(**{**vars(v), "name": f"attitude check {v.name}"}) for v in self.history.consistency_checks),
+            Check("attitude-nees", f"{name} size", nees, 0.0, high, nees <= high, self.remark),
+            Check("attitude-coverage", f"{name} share inside", inside, LEAST_INSIDE, 1.0, covers, self.remark),
+            *(replace(check, name=f"{name} {check.name}") for check in self.history.consistency_checks),
         )
 
 

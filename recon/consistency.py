@@ -183,17 +183,11 @@ def mcreynolds_checks(
         share = float(inside[:, part][use].mean()) if use.any() else 1.0
         out.append(
             Check.of(
-                "filter-smoother",
-                f"filter-smoother {name}",
-                share,
-                _LEAST_INSIDE,
-                1.0,
-                "filter and smoother differ as predicted",
-                "filter and smoother differ more than predicted",
-                advice="process noise or an error model is too small",
-                component=name,
+                "filter-smoother", f"filter-smoother {name}", share, _LEAST_INSIDE, 1.0,
+                "filter and smoother differ as predicted", "filter and smoother differ more than predicted",
+                advice="process noise or an error model is too small", component=name,
             )
-        )
+        )  # fmt: skip
     return out
 
 

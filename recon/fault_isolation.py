@@ -220,13 +220,10 @@ def leave_one_out_findings(left_out: tuple[LeftOut, ...]) -> list[Issue]:
         Issue(
             f"without it the trajectory moves by up to {s.distance_m:.0f} m, more than the standard deviations allow; "
             "they were enlarged by the difference",
-            "tracker-inconsistent",
-            s.source,
-            s.start_s,
-            s.end_s,
+            "tracker-inconsistent", s.source, s.start_s, s.end_s,
         )
         for s in _supported(left_out)
-    ]
+    ]  # fmt: skip
 
 
 def rejected_points(
@@ -337,14 +334,11 @@ def prior_inflation_findings(
         Issue(
             f"{name}: {rows.estimate[name]:.3g} ± {rows.sd[name]:.2g} {rows.unit[name]}; a priori sd inflated from "
             f"{rows.prior_sd[name]:.2g} to {sd:.2g} {rows.unit[name]}",
-            "prior-inflated",
-            name.split()[0],
-            start_s,
-            end_s,
+            "prior-inflated", name.split()[0], start_s, end_s,
         )
         for name, sd in inflated_sd.items()
         if name in rows.index
-    ]
+    ]  # fmt: skip
 
 
 # ---- fault hypotheses

@@ -195,13 +195,10 @@ def _exclude_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolA
     return [
         Issue(
             f"{b - a + 1} samples repeat those from {t[whole[a0]]:.3f} s on under other times: excluded",
-            "repeated-block",
-            spec.name,
-            float(t[whole[a]]),
-            float(t[whole[b]]),
+            "repeated-block", spec.name, float(t[whole[a]]), float(t[whole[b]]),
         )
         for a, b, a0 in blocks
-    ]
+    ]  # fmt: skip
 
 
 def _with_bridges(t: FloatArray) -> FloatArray:

@@ -343,14 +343,5 @@ def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) ->
         bad += rate.spec.name
         advice = "check the mount and the column order of both"
     value = max(found.gain, LOG_LIKELIHOOD_LIMIT + 1.0) if off else 0.0
-    return Check.of(
-        "triads-axes",
-        f"axes of {names}",
-        value,
-        0.0,
-        LOG_LIKELIHOOD_LIMIT,
-        good,
-        bad,
-        advice=advice,
-        component=found.kind,
-    )
+    limits, kind = (0.0, LOG_LIKELIHOOD_LIMIT), found.kind
+    return Check.of("triads-axes", f"axes of {names}", value, *limits, good, bad, advice=advice, component=kind)

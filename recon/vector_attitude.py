@@ -305,17 +305,12 @@ def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[
         low, high = (chi_square_quantile(p, expected) / expected for p in (tail, 1.0 - tail))
         out.append(
             Check.of(
-                "attitude-residuals",
-                f"residuals {name}",
-                squares / expected,
-                float(low) - _MISFIT_ALLOWANCE,
-                float(high) + _MISFIT_ALLOWANCE,
-                f"{name}: residuals as large as its noise",
+                "attitude-residuals", f"residuals {name}", squares / expected, float(low) - _MISFIT_ALLOWANCE,
+                float(high) + _MISFIT_ALLOWANCE, f"{name}: residuals as large as its noise",
                 f"{name}: residuals are not as large as its noise",
-                advice="check noise, clocking and interference",
-                source=name,
+                advice="check noise, clocking and interference", source=name,
             )
-        )
+        )  # fmt: skip
     sd = np.sqrt(np.diagonal(fit.error_covariance))
     for name in dict.fromkeys(terms.instruments):
         own = terms.of(name)
