@@ -27,12 +27,21 @@ import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
 from estimators.camera_fit import Image, OrientedCamera
-from estimators.edge import NO_FAULT, no_horizon
+from estimators.edge import no_horizon
 from estimators.frame_edits import edited
 from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, Progress, check_finite, check_increasing
+from flightmodel.checks import (
+    NO_FAULT,
+    BoolArray,
+    FloatArray,
+    GateError,
+    Issue,
+    Progress,
+    check_finite,
+    check_increasing,
+)
 from flightmodel.deflection import (
     DeflectionHistory,
     history_from_lateral,
@@ -59,7 +68,7 @@ _NOT_THE_SHELL = (
 _PAINTED, _LEAST_PAINTED = 0.25, 3
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _EDGE_FOR_PLANE = 0.5  # of the edge in the benchmark frame: a frame needs half as much, found in both
-_FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
+_FROZEN = Issue("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
@@ -347,7 +356,7 @@ def judged(
     verdicts = [edits.verdict(float(t)) for t in time_s]
     rejected = [v is not None and v.edit == "reject" for v in verdicts]
     kept = [
-        refused_fit(fit.horizon, Fault(f"rejected by hand: {verdict.note or 'no reason given'}", "rejected-by-hand"))
+        refused_fit(fit.horizon, Issue(f"rejected by hand: {verdict.note or 'no reason given'}", "rejected-by-hand"))
         if verdict is not None and out
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
@@ -369,7 +378,7 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
 def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse frames answered by the edge alone, where it does not contradict features that were found."""
     words = "no feature agrees where other frames show some that do: whether the edge is the shell's is not known"
-    lost = Fault(words, "features-lost")
+    lost = Issue(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
 
@@ -388,7 +397,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
     if with_texture.sum() >= _LEAST_PAINTED and np.mean(agreed[with_texture]) > _PAINTED * agreed.max():
         return _without_bare(fits)
     words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
-    fault = Fault(words, "texture-strays")
+    fault = Issue(words, "texture-strays")
     return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]
 
 
@@ -399,7 +408,7 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
     if len(shown) < _LEVEL_FRAMES or refused <= _MOST:
         return fits
     words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
-    return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mostly-refused")) for fit in fits]
+    return [fit if fit.refused else refused_fit(fit.horizon, Issue(words, "film-mostly-refused")) for fit in fits]
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
@@ -418,10 +427,10 @@ def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
     for k, fit in enumerate(fits):
         at, fault = int(np.searchsorted(telling, k)), NO_FAULT
         if np.isnan(fit.mount_px) and moved[max(at - 1, 0) : at + 1].any():
-            fault = Fault(unseen, "camera-turned")
+            fault = Issue(unseen, "camera-turned")
         elif not np.isnan(fit.mount_px) and moved[at]:
             words = f"the centerbody's own edge has moved by up to {fit.mount_px:.1f} px, here and in a frame beside it"
-            fault = Fault(f"{words}: the camera moved in its mount, or the picture was moved", "camera-turned")
+            fault = Issue(f"{words}: the camera moved in its mount, or the picture was moved", "camera-turned")
         out.append(refused_fit(fit.horizon, fault) if fault and not fit.refused else fit)
     return out
 
@@ -438,7 +447,7 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     for k, fit in enumerate(fits):
         around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
         doubtful = not fit.refused and int(around.sum()) >= _DOUBTFUL
-        out.append(refused_fit(fit.horizon, Fault(words, "frames-around-refused")) if doubtful else fit)
+        out.append(refused_fit(fit.horizon, Issue(words, "frames-around-refused")) if doubtful else fit)
     return out
 
 
@@ -486,7 +495,7 @@ def without_jumps(time_s: FloatArray, fits: list[FrameFit], swing: JointSwing) -
             f"jumps by {np.rad2deg(min(change[k - 1], change[k])):.1f} deg from both neighbours, faster than the joint "
             f"swings at {swing.frequency_hz:.1f} Hz"
         )
-        out[answered[k]] = refused_fit(out[answered[k]].horizon, Fault(words, "jump-too-fast"))
+        out[answered[k]] = refused_fit(out[answered[k]].horizon, Issue(words, "jump-too-fast"))
     return out
 
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from estimators.body_edge import UNMOVED, UNSEEN, MountMotion
 from estimators.edge import (
-    NO_FAULT,
     HorizonLine,
     breaks_across,
     fault_of_frame,
@@ -54,7 +53,7 @@ from estimators.frame_solution import (
 )
 from estimators.texture import PaintedTexture
 from estimators.virtual_camera import DEFLECTION
-from flightmodel.checks import Fault, FloatArray
+from flightmodel.checks import NO_FAULT, FloatArray, Issue
 from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
@@ -191,7 +190,7 @@ class OrientedCamera(FrameModel):
             with_open_plane=with_open_plane,
         )  # fmt: skip
 
-    def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
+    def _fault_of_breaks(self, frame: EditedFrame) -> Issue:
         """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.
 
         What is hidden, as a line of text, may be as wide.
@@ -200,7 +199,7 @@ class OrientedCamera(FrameModel):
             hidden = 0.0 if frame.hidden is None else float(frame.hidden[row : row + 2].mean())
             if hidden < _HIDDEN_BREAK and not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
                 words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
-                return Fault(words, "frame-broken")
+                return Issue(words, "frame-broken")
         return NO_FAULT
 
     def _explained(
@@ -393,7 +392,7 @@ class OrientedCamera(FrameModel):
         """
         best: tuple[float, FloatArray, _Approached] | None = None
         turned = False
-        trouble = Fault("no edge near where one is expected", "edge-not-clear")
+        trouble = Issue("no edge near where one is expected", "edge-not-clear")
         for guess, reaches_px in self._guesses(frame, deformation.copy()):
             moved = guess.copy()
             try:

@@ -32,10 +32,9 @@ from scipy.ndimage import median_filter
 from scipy.special import ndtr
 
 from estimators import _edge_kernels
-from flightmodel.checks import BoolArray, Fault, FloatArray
+from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, Issue
 
 Image = NDArray[np.uint8]
-NO_FAULT = Fault("")
 
 STEP_PX = 0.5  # two samples a pixel: the smoothing below passes nothing shorter
 _SMOOTHING_PX = 0.8  # white noise falls to a third, an edge is not blurred beyond what its lens does
@@ -100,7 +99,7 @@ class HorizonLine:
         Standard deviation of each point along ``inward_px``.
     line : (n,) int
         Index of the scan line that each point was found on (`ScanLines.index`).
-    refused : Fault
+    refused : Issue
         Why the frame cannot be used, with its code; empty when it can.
     is_by_hand : bool
         Whether an analyst marked the points.
@@ -110,7 +109,7 @@ class HorizonLine:
     inward_px: FloatArray
     sd_px: FloatArray
     line: NDArray[np.intp]
-    refused: Fault = NO_FAULT
+    refused: Issue = NO_FAULT
     is_by_hand: bool = False
 
     def some(self, chosen: BoolArray) -> HorizonLine:
@@ -140,34 +139,34 @@ class HorizonLine:
         return float(c0 - c1**2 / (4.0 * c2)) if c2 > 1e-6 else float(v.min())
 
 
-def no_horizon(reason: Fault) -> HorizonLine:
+def no_horizon(reason: Issue) -> HorizonLine:
     """No edge points, and why."""
     return HorizonLine(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, dtype=np.intp), reason)
 
 
-def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Fault:
+def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Issue:
     """Why a frame cannot be used, before any edge is searched: size, darkness, saturation; empty when it can."""
     kept = kept_picture(picture)
     image = kept.image
     if image.size == 0:
-        return Fault("cannot be decoded", "frame-undecodable")
+        return Issue("cannot be decoded", "frame-undecodable")
     if image.ndim != 2 or image.dtype != np.uint8:
-        return Fault(f"not an 8-bit grey image (shape {image.shape}, {image.dtype})", "frame-not-grey")
+        return Issue(f"not an 8-bit grey image (shape {image.shape}, {image.dtype})", "frame-not-grey")
     if image.shape != (size_px[1], size_px[0]):
         size = f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
-        return Fault(size, "frame-size")
+        return Issue(size, "frame-size")
     # of a part of the pixels: as good, and quicker
     below = np.cumsum(np.bincount(image[::8, ::4].ravel(), minlength=256))
     low, high = np.searchsorted(below, [0.05 * below[-1], 0.95 * below[-1]], side="right").tolist()
     saturated = float(np.mean(image[::4, ::4] >= 254))
     if high < 2.0 * _LEAST_CONTRAST:
-        return Fault(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-dark")
+        return Issue(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-dark")
     if low > 250 or saturated > 0.5:
-        return Fault("saturated: more than half of the pixels are at full scale", "frame-saturated")
+        return Issue("saturated: more than half of the pixels are at full scale", "frame-saturated")
     return _fault_of_fields(*kept.differences[:2])
 
 
-def _fault_of_fields(one: FloatArray, two: FloatArray) -> Fault:
+def _fault_of_fields(one: FloatArray, two: FloatArray) -> Issue:
     """Whether every other row is of another moment: then rows next to each other differ more than every other one.
 
     In a picture of one moment the difference grows with the distance of the rows, and noise is in both alike. Fields
@@ -181,7 +180,7 @@ def _fault_of_fields(one: FloatArray, two: FloatArray) -> Fault:
         words = (
             f"its rows in turns are of two moments, in {100.0 * combed / one.size:.0f} % of the picture: deinterlace it"
         )
-        return Fault(words, "frame-fields-differ")
+        return Issue(words, "frame-fields-differ")
     return NO_FAULT
 
 
@@ -220,7 +219,7 @@ def find_horizon(image: Image | KeptPicture, lines: ScanLines, size_px: tuple[in
     refused = NO_FAULT
     if good.mean() < _LEAST_SHARE:
         share = f"{100.0 * good.mean():.0f} % of the scan lines cross one ({100 * _LEAST_SHARE:.0f} % needed)"
-        refused = Fault(f"no clear edge: {share}", "edge-not-clear")
+        refused = Issue(f"no clear edge: {share}", "edge-not-clear")
     points = lines.origin_px + place[:, None] * lines.inward_px
     return HorizonLine(
         points[good], lines.inward_px[good], np.hypot(sd[good], _SD_FLOOR_PX), lines.index[good], refused

@@ -38,14 +38,14 @@ from numpy.typing import NDArray
 
 from estimators import _fit_kernels
 from estimators.body_edge import BodyEdge
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines
+from estimators.edge import HorizonLine, ScanLines
 from estimators.features import Features, ImageFeatures, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS, MarkedFeatures
 from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
 from estimators.texture import PaintedTexture
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, GateError, Issue
 from flightmodel.deflection import lv_clock
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
@@ -128,7 +128,7 @@ class FrameFit:
     features : int
         Rows of features used.
     horizon : HorizonLine
-    refused : Fault
+    refused : Issue
         Why there is no answer; empty when there is one.
     contradicted : bool
         Whether a whole edge alone gave the answer, against the features.
@@ -155,7 +155,7 @@ class FrameFit:
     residual_rms_px: float
     features: int
     horizon: HorizonLine
-    refused: Fault = NO_FAULT
+    refused: Issue = NO_FAULT
     contradicted: bool = False
     mount_px: float = float("nan")
     mount_is_sure: bool = True
@@ -228,7 +228,7 @@ def least_points(horizon: HorizonLine) -> int:
 
 
 def refused_fit(
-    horizon: HorizonLine, reason: Fault, mount_px: float = float("nan"), mount_is_sure: bool = True
+    horizon: HorizonLine, reason: Issue, mount_px: float = float("nan"), mount_is_sure: bool = True
 ) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
@@ -263,7 +263,7 @@ class FrameModel:
         Their shift per radian of deflection of the benchmark frame.
     residual_rms_px : float
         Of the benchmark frame.
-    stated_refused : Fault
+    stated_refused : Issue
         Why the features that the vehicle file states are not used; empty where they are, or where it states none.
     support : float
         Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
@@ -287,7 +287,7 @@ class FrameModel:
     posed_covariance: FloatArray = field(repr=False)
     posed_per_deflection: FloatArray = field(repr=False)
     residual_rms_px: float
-    stated_refused: Fault = NO_FAULT
+    stated_refused: Issue = NO_FAULT
     support: float = 1.0
     breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
     steepness: float = float("nan")

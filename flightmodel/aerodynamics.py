@@ -42,7 +42,7 @@ from xml.parsers import expat
 import numpy as np
 from pydantic import Field
 
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, TableRangeError
 from flightmodel.config import (
     FileBeside,
     Fraction,
@@ -177,17 +177,17 @@ def check_axial_flow(path: Path, table: AeroTable) -> None:
         raise GateError(faults[:MOST_FAULTS], code="aero-axial-flow")
 
 
-def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Fault]:
+def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Issue]:
     """Say what no row of a coefficient table may hold; ``row`` is finite, in the order of ``names``."""
     mach, alpha = row[:2]
     faults = (
-        [] if mach >= 0.0 else [Fault(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "aero-mach")]
+        [] if mach >= 0.0 else [Issue(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "aero-mach")]
     )
     if not 0.0 <= alpha <= 180.0:
-        faults.append(Fault(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "aero-angle"))
+        faults.append(Issue(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "aero-angle"))
     if alpha == 0.0:
         off = [k for k in (3, 4) if abs(row[k]) > AXIAL_TOLERANCE]
-        faults += [Fault(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-axial-flow") for k in off]
+        faults += [Issue(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-axial-flow") for k in off]
     return faults
 
 
@@ -228,9 +228,9 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     for k, line in lines[1:]:
         row, wrong = _grid_point(line, names, columns)
         rows.append(row)
-        faults += [Fault(f"{path}, line {k}: {fault}", fault.code) for fault in wrong]
+        faults += [Issue(f"{path}, line {k}: {fault}", fault.code) for fault in wrong]
     if faults:
-        more = Fault(f"{path}: {len(faults)} faults in all", "more-faults")
+        more = Issue(f"{path}: {len(faults)} faults in all", "more-faults")
         raise GateError([*faults[:MOST_FAULTS], *[more] * (len(faults) > MOST_FAULTS)])
     return _on_grid(path, np.array(rows, dtype=float).reshape(-1, len(names)))
 
@@ -252,16 +252,16 @@ def _columns(path: Path, names: tuple[str, ...], head: tuple[int, str]) -> list[
     return header
 
 
-def _grid_point(line: str, names: tuple[str, ...], columns: list[str]) -> tuple[list[float], list[Fault]]:
+def _grid_point(line: str, names: tuple[str, ...], columns: list[str]) -> tuple[list[float], list[Issue]]:
     """Numbers of a line in the order of ``names``, and what is wrong with them."""
     cells = [cell.strip() for cell in line.split("#")[0].split(",")]
     if len(cells) != len(columns):
         words = f"{len(cells)} cells where {len(columns)} are wanted; got '{line.strip()}'"
-        return [], [Fault(words, "row-ragged")]
+        return [], [Issue(words, "row-ragged")]
     there = {c: cells[columns.index(c)] for c in names}
     row = [plain_number(cell) for cell in there.values()]
     bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
-    faults = [Fault(f"column '{c}': '{there[c]}' is no finite number", "not-a-number") for c in bad]
+    faults = [Issue(f"column '{c}': '{there[c]}' is no finite number", "not-a-number") for c in bad]
     return row, faults or _row_faults(row, names)
 
 
@@ -272,13 +272,13 @@ def _on_grid(path: Path, values: FloatArray) -> AeroTable:
     faults = []
     if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
         wanted = f"{len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
-        faults.append(Fault(f"{path}: {len(values)} rows where {wanted}", "aero-grid"))
+        faults.append(Issue(f"{path}: {len(values)} rows where {wanted}", "aero-grid"))
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
         words = "angles must be evenly spaced from 0, and at least two, as Mach numbers"
-        faults.append(Fault(f"{path}: {words}", "aero-grid"))
+        faults.append(Issue(f"{path}: {words}", "aero-grid"))
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:
         words = f"angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met"
-        faults.append(Fault(f"{path}: {words}", "aero-grid"))
+        faults.append(Issue(f"{path}: {words}", "aero-grid"))
     if faults:
         raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
@@ -337,14 +337,14 @@ def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> Aero
         if not match:
             if coefficient != "CMQ":
                 faults.append(
-                    Fault(
+                    Issue(
                         f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}",
                         "daveml-variable",
                     )
                 )
         elif match[0] not in functions:
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)",
                     "daveml-variable",
                 )
@@ -397,7 +397,7 @@ def _numbers(path: Path, element: ET.Element | None, where: str, faults: list[st
     except ValueError:
         values = np.array([])
     if len(values) == 0 or not np.isfinite(values).all():
-        faults.append(Fault(f"{path}: '{where}' holds no list of finite numbers", "daveml-numbers"))
+        faults.append(Issue(f"{path}: '{where}' holds no list of finite numbers", "daveml-numbers"))
     return values
 
 
@@ -414,7 +414,7 @@ def _grid(
         axes.append("mach" if alias & MACH_NAMES else "alpha" if alias & ALPHA_NAMES else "")
         if not axes[-1]:
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read",
                     "daveml-input",
                 )
@@ -426,7 +426,7 @@ def _grid(
         table = tables.get(link.get("gtID", "")) if link is not None else None
     if table is None:
         faults.append(
-            Fault(
+            Issue(
                 f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read",
                 "daveml-ungridded",
             )
@@ -434,16 +434,16 @@ def _grid(
         return None
     units = table.get("units") or (variables[output].get("units") or "")
     if units not in NO_UNITS:
-        faults.append(Fault(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unit"))
+        faults.append(Issue(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unit"))
     grids = []
     for reference, name, axis in zip(table.findall("breakpointRefs/bpRef"), inputs, axes, strict=False):
         knots = points.get(reference.get("bpID", ""), np.array([]))
         unit = (variables[name].get("units") or "") if name in variables else ""
         if axis == "alpha" and unit not in ANGLE_UNITS:
-            faults.append(Fault(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unit"))
+            faults.append(Issue(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unit"))
         if len(knots) < 2 or (np.diff(knots) <= 0).any():
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined",
                     "daveml-breakpoints",
                 )
@@ -452,7 +452,7 @@ def _grid(
     values = _numbers(path, table.find("dataTable"), output, faults)
     if len(grids) != len(inputs) or not inputs or values.size != np.prod([len(g) for g in grids]):
         faults.append(
-            Fault(
+            Issue(
                 f"{path}: '{output}' has {values.size} values where its breakpoints want another number",
                 "daveml-breakpoints",
             )
@@ -654,7 +654,7 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
         sidecar = read_section(Sidecar, beside)
     except ConfigError as fault:
         wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
-        faults += fault.faults if beside.exists() else [Fault(f"{beside}: no such file{wanted}", "sidecar-missing")]
+        faults += fault.faults if beside.exists() else [Issue(f"{beside}: no such file{wanted}", "sidecar-missing")]
     wind = sidecar is not None and sidecar.axes == "wind"
     names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
     try:

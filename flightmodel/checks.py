@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import isfinite, nan
 from numbers import Integral
 from pathlib import Path
 
@@ -24,27 +26,105 @@ def part_of(report: Progress, first: float, last: float) -> Progress:
     return lambda fraction, what: report(first + (last - first) * fraction, what)
 
 
-class Fault(str):
-    """One sentence of refusal with a short stable code (``"frame-missing"``), which scripts and tests may use.
+class Issue(str):
+    """Something that is said of data, a model or an answer: its words, with a stable code, its source and its span.
+
+    A refusal, a finding or a suspicion. It is a text: ``str(issue)`` gives its words.
 
     Parameters
     ----------
     words : str
-        What is wrong, where (file and line, or source and time), the value, and what to try.
+        What is said, with the value and what to try; of a refusal also where: file and line, or source and time.
     code : str
-        Lower-case words joined by hyphens. The words may be edited freely; the code stays.
+        Lower-case words joined by hyphens (``"data-gap"``), for scripts and tests. The words may be edited freely; the
+        code stays. Where none is given, that of the words is kept.
+    source : str or tuple of str
+        Sensor, file or model that it is about; empty where the words say it.
+    start_s, end_s : float
+        Span that it is about; NaN where it is not about a time.
     """
 
     code: str
+    source: str
+    sources: tuple[str, ...]
+    start_s: float
+    end_s: float
 
-    def __new__(cls, words: str, code: str = "") -> Fault:
-        """Keep the code that the words have where no other is given."""
-        fault = super().__new__(cls, words)
-        fault.code = code or getattr(words, "code", "")
-        return fault
+    def __new__(
+        cls, words: str, code: str = "", source: str | tuple[str, ...] = "", start_s: float = nan, end_s: float = nan
+    ) -> Issue:
+        """Text with its code and place."""
+        issue = super().__new__(cls, words)
+        issue.code = code or getattr(words, "code", "")
+        issue.sources = (source,) * bool(source) if isinstance(source, str) else source
+        issue.source, issue.start_s, issue.end_s = ", ".join(issue.sources), start_s, end_s
+        return issue
+
+    @property
+    def what(self) -> str:
+        """Its words alone."""
+        return str(self)
+
+    @property
+    def line(self) -> str:
+        """Source, words and span, for tables and logs."""
+        if not isfinite(self.start_s):
+            return f"{self.source}: {self}"
+        first, last = f"{self.start_s:.3f}", f"{self.end_s:.3f} s"
+        return f"{self.source}: {self} ({f'at {last}' if self.end_s == self.start_s else f'{first} to {last}'})"
+
+    def as_row(self) -> dict[str, str | float]:
+        """Columns of ``findings.csv``."""
+        named = "source", "what", "start_s", "end_s", "code"
+        return {name: getattr(self, name) for name in named}
 
 
-NO_FAULT = Fault("")
+NO_FAULT = Issue("")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One statistic, the band it should lie in, whether it does, and what follows.
+
+    Parameters
+    ----------
+    code : str
+        Short and stable: ``"nis"``, ``"whiteness"``, ...
+    name : str
+        The statistic and what it is of.
+    value, low, high : float
+    passed : bool
+    remark : str
+        What was found and, where the check failed, what that means and what to check.
+    source : str
+        Tracker or sensor that it is about; empty where it is about the flight.
+    component : str
+        Component or error of that source that it is about.
+    symptom : str
+        What was found, without what follows.
+    """
+
+    code: str
+    name: str
+    value: float
+    low: float
+    high: float
+    passed: bool
+    remark: str
+    source: str = ""
+    component: str = ""
+    symptom: str = ""
+
+    @classmethod
+    def of(
+        cls, code: str, name: str, value: float, low: float, high: float, good: str, bad: str,
+        *, advice: str = "", source: str = "", component: str = "",
+    ) -> Check:  # fmt: skip
+        """Check with the symptom that fits, ``good`` or ``bad``; ``advice`` follows where it failed."""
+        passed = bool(low <= value <= high)
+        symptom = good if passed else bad
+        remark = f"{symptom}: {advice}" if advice and not passed else symptom
+        return cls(code, name, float(value), float(low), float(high), passed, remark, source, component, symptom)
 
 
 class GateError(ValueError):
@@ -53,7 +133,7 @@ class GateError(ValueError):
     Parameters
     ----------
     faults : str or sequence of str
-        Each: what is wrong, where (file and line, or source and time), and what to try; a `Fault` has its own code.
+        Each: what is wrong, where (file and line, or source and time), and what to try; an `Issue` has its own code.
     code : str
         Code of those faults that have none of their own.
     """
@@ -62,7 +142,7 @@ class GateError(ValueError):
 
     def __init__(self, faults: str | Sequence[str], code: str = "") -> None:
         listed = (faults,) if isinstance(faults, str) else tuple(faults)
-        self.faults: tuple[Fault, ...] = tuple(Fault(words, getattr(words, "code", "") or code) for words in listed)
+        self.faults: tuple[Issue, ...] = tuple(Issue(words, getattr(words, "code", "") or code) for words in listed)
         super().__init__("\n".join(self.faults))
 
     @property

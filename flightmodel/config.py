@@ -22,7 +22,7 @@ from pydantic import (
     model_validator,
 )
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.files import file_bytes, leads_outside, nothing_at
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
@@ -67,7 +67,7 @@ def beside(value: str) -> str:
 
 FileBeside = Annotated[str, AfterValidator(beside)]
 
-# key below the table that is checked ("" for the table), its value, what is wrong; a `Fault` has its own code
+# key below the table that is checked ("" for the table), its value, what is wrong; an `Issue` has its own code
 KeyFault = tuple[str, object, str]
 
 
@@ -171,7 +171,7 @@ def read_section(model: type[SectionT], path: Path) -> SectionT:
         return parse_section(model, tables, str(path))
     except ConfigError as fault:
         absent = [
-            Fault(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
+            Issue(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
             for key, name in _named_files(tables)
             if not any(f"key '{key}'" in words for words in fault.faults) and not leads_outside(path.parent, name)
             if not os.path.exists(path.parent / name)  # False also for a name too long for a file
@@ -207,18 +207,18 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
+def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Issue]:
     """Faults that one item of pydantic's list means."""
     path = [str(part) for part in item["loc"]]
     if path and path[-1] == "[key]":
-        return [Fault(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
+        return [Issue(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])
         hint = f"{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"
-        return [Fault(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
+        return [Issue(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
     if item["type"] == "missing":
-        return [Fault(f"{where}: key '{key}' is missing", "key-missing")]
+        return [Issue(f"{where}: key '{key}' is missing", "key-missing")]
     words = item["msg"].removeprefix("Value error, ")
     if item["type"] == "model_type":
         words = f"a table is wanted here, with keys among {', '.join(_keys_beside(model, path))}"
@@ -227,11 +227,11 @@ def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
         out = []
         for name, value, text in cause.faults:
             at = f"'{'.'.join([*path, name])}' = {_shown(value)}" if name else f"'{key}'"
-            out.append(Fault(f"{where}: key {at}: {text}", getattr(text, "code", "keys-conflict")))
+            out.append(Issue(f"{where}: key {at}: {text}", getattr(text, "code", "keys-conflict")))
         return out
     if isinstance(item["input"], (dict, BaseModel)):
-        return [Fault(f"{where}: key '{key}': {words}", "keys-conflict")]
-    return [Fault(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
+        return [Issue(f"{where}: key '{key}': {words}", "keys-conflict")]
+    return [Issue(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
 
 
 def _keys_beside(model: Any, path: list[str]) -> list[str]:

@@ -21,11 +21,11 @@ import numpy as np
 from pydantic import Field
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import Fault, FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, Issue
 from flightmodel.config import Angle, Elevation, KeyFault, Latitude, Longitude, Section, Time
 from flightmodel.gate import Gate
 from flightmodel.tables import Source
-from flightmodel.telemetry import Finding, StatedDrag, StatePrior, TriadRecord
+from flightmodel.telemetry import StatedDrag, StatePrior, TriadRecord
 
 Axes = Literal["fixed", "inertial", "j2000"]
 Triple = tuple[float, float, float]
@@ -104,7 +104,7 @@ class StateEntry(Section):
             unit = matrix / np.outer(scale, scale)
             if (variance <= 0.0).any() or not np.allclose(unit, unit.T, atol=1e-6) \
                     or np.linalg.eigvalsh(0.5 * (unit + unit.T))[0] < -1e-6:  # fmt: skip
-                words = Fault("a covariance is symmetric with positive eigenvalues", "covariance-impossible")
+                words = Issue("a covariance is symmetric with positive eigenvalues", "covariance-impossible")
                 yield "covariance", "...", words
 
     def prior(self, t0_utc: str, planet: earth.Planet) -> StatePrior:
@@ -217,7 +217,7 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
             f"C_A of {largest:.3g}: stagnation pressure on all of the frontal area gives {_MOST_C_A:g}; "
             "is area_m2 or diameter_m of the same reference as c_a?"
         )
-        gate.findings.append(Finding("drag", words, np.nan, np.nan, code="drag-large"))
+        gate.findings.append(Issue(words, "drag-large", "drag"))
     area = entry.area_m2 if entry.diameter_m is None else 0.25 * np.pi * entry.diameter_m**2
     assert area is not None
     sd = 0.01 * float(np.hypot(entry.c_a_sd_percent, entry.mass_sd_percent))

@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import (
     Angle,
     Duration,
@@ -76,7 +76,6 @@ from flightmodel.tables import GNSS_SD, Source, Spans
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
-    Finding,
     GnssRecord,
     KnownPlace,
     Motion,
@@ -291,7 +290,7 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self, needs_path: bool = True) -> Iterator[Fault]:
+    def misfits(self, needs_path: bool = True) -> Iterator[Issue]:
         """Yield what does not go together, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
@@ -299,46 +298,46 @@ class FlightFile(Section):
         yield from self._misfits_of_planet()
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
-            yield Fault(words, "drag-twice")
+            yield Issue(words, "drag-twice")
         if needs_path or self.radars or self.gnss or not self.films:
             yield from self._misfits_of_path()
         if self.films and self.vehicle is None:
             tables = ", ".join(self.films)
-            yield Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
+            yield Issue(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
-            yield Fault(words, "frames-twice")
+            yield Issue(words, "frames-twice")
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
             if name in _TAKEN:
                 words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
-            yield Fault(words, "name-twice")
+            yield Issue(words, "name-twice")
 
-    def _misfits_of_planet(self) -> Iterator[Fault]:
+    def _misfits_of_planet(self) -> Iterator[Issue]:
         """Yield what is known of the Earth alone."""
         if self.body == WGS84:
             return
         where = f'planet = "{self.planet}"'
         if self.sensors.magnetometer is not None:
-            yield Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown")
+            yield Issue(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown")
         if self.sensors.sun is not None:
             words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
-            yield Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown")
+            yield Issue(f"[sensors.sun]: {where}: {words}", "sun-unknown")
         for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
             for name, entry in entries.items():
                 if entry.height_is == "msl" and entry.geoid_undulation_m is None:
                     words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
-                    yield Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown")
+                    yield Issue(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown")
         if self.start.at_rest is not None:
             words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
-            yield Fault(f"start.at_rest: {where}: {words}", "rest-unknown")
+            yield Issue(f"start.at_rest: {where}: {words}", "rest-unknown")
 
-    def _misfits_of_drag(self) -> Iterator[Fault]:
+    def _misfits_of_drag(self) -> Iterator[Issue]:
         """Yield what ballistic flight and an accelerometer without gyros lack."""
         if self.motion.model == "ballistic" and self.motion.drag_area_per_mass_m2pkg is None and self.drag is None:
             words = "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd), or [drag]"
-            yield Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict")
+            yield Issue(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict")
         entry = self.sensors.accelerometer
         if entry is not None and self.measures_deceleration and entry.mount in (None, "body"):
             axial = entry.dcm_body_sensor[0]
@@ -347,12 +346,12 @@ class FlightFile(Section):
                 words = (
                     f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
                 )
-                yield Fault(f"sensors.accelerometer: {words}", "axial-missing")
+                yield Issue(f"sensors.accelerometer: {words}", "axial-missing")
         elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
             words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
-            yield Fault(f"sensors.accelerometer.{words}", "inertial-missing")
+            yield Issue(f"sensors.accelerometer.{words}", "inertial-missing")
 
-    def _misfits_of_path(self) -> Iterator[Fault]:
+    def _misfits_of_path(self) -> Iterator[Issue]:
         """Yield what keeps a path from being found."""
         yield from self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
@@ -361,26 +360,26 @@ class FlightFile(Section):
             words = (
                 f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them, or [start.state]{also}"
             )
-            yield Fault(words, "tracker-missing")
+            yield Issue(words, "tracker-missing")
         if len(triads) == 1 and not self.measures_deceleration:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
             words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
             if triads == ["accelerometer"]:
                 words += ', or write model = "ballistic" in [motion], where an accelerometer measures the drag'
-            yield Fault(words, "inertial-missing")
+            yield Issue(words, "inertial-missing")
         if self.motion.model == "strapdown" and not triads:
             words = (
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
-            yield Fault(f'motion.model = "strapdown" {words}', "inertial-missing")
+            yield Issue(f'motion.model = "strapdown" {words}', "inertial-missing")
         attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
         if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
             words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
-            yield Fault(f"{words}; take [start] out", "rest-without-inertial")
+            yield Issue(f"{words}; take [start] out", "rest-without-inertial")
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
             words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
-            yield Fault(words, "attitude-missing")
+            yield Issue(words, "attitude-missing")
 
 
 def read_flight_file(folder: Path) -> FlightFile:
@@ -455,7 +454,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
-        gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
+        gate.findings.append(Issue(words, "inertial-unused", "motion"))
     measured = spec.atmosphere is not None
     place = _first_place(radars, gnss, spec.body, state)
     barometers = {
@@ -553,14 +552,14 @@ def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
         vehicle = vehicle_from_toml(path).with_events((event.name, event.t_s) for event in events)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"vehicle: {each}", each.code))
+            gate.refuse_config(Issue(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
         use, code = "the camera's fit is of its edge and surface", "mesh-fitted"
         if body == "centerbody":
             use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-drawn"
         code = "mesh-apart" if mesh.apart else code
-        gate.findings.append(Finding(f"mesh of the {body}", f"{mesh.words}; {use}", np.nan, np.nan, code))
+        gate.findings.append(Issue(f"{mesh.words}; {use}", code, f"mesh of the {body}"))
     return vehicle
 
 
@@ -579,13 +578,13 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
         return read_sounding(gate, spec.atmosphere, spec.body)
     if spec.body != WGS84:
         words = f"no [atmosphere]: the standard atmosphere of {spec.planet.capitalize()} without wind stands for it"
-        gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+        gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
         return standard_sounding(spec.body)
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 stands for it, density to 10 % (24 % from 80 km), "
         "wind to 15 m/s"
     )
-    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+    gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
     return standard_sounding()
 
 
@@ -621,7 +620,7 @@ def _state(gate: Gate, spec: FlightFile) -> StatePrior | None:
         return spec.start.state.prior(spec.t0_utc, spec.body)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"start.state: {each}", each.code))
+            gate.refuse_config(Issue(f"start.state: {each}", each.code))
         return None
 
 
@@ -630,7 +629,7 @@ def _start(entry: StartEntry) -> Start:
     return Start(entry.at_rest, entry.sd_mps, azimuth, float(np.deg2rad(entry.azimuth_sd_deg)))
 
 
-def _rest_findings(telemetry: Telemetry) -> list[Finding]:
+def _rest_findings(telemetry: Telemetry) -> list[Issue]:
     """A rest that the data begin with and flight.toml does not state."""
     if telemetry.motion.model != "strapdown" or telemetry.start.at_rest is not None:
         return []
@@ -644,13 +643,13 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
         f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
         f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     )
-    out = [Finding("start", words, *span, code="rest-found")]
+    out = [Issue(words, "rest-found", "start", *span)]
     rates = telemetry.rates
     turning = float(np.abs(mean_readings(rates, span).mean).max()) - telemetry.planet.rate_radps
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
         words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
-        out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
+        out.append(Issue(words, "bias-beyond-data-sheet", rates.spec.name, *span))
     return out
 
 

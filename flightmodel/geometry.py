@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, PrivateAttr
 
 from flightmodel import rotations
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import FileBeside, KeyFault, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
@@ -331,7 +331,7 @@ Faces = NDArray[np.int64]
 
 KINDS = (".stl", ".obj", ".glb")
 LARGEST_BYTES, MOST_FACES, MOST_NODES = 50_000_000, 500_000, 10_000
-EMPTY = Fault("is empty: it has no face", "mesh-empty")
+EMPTY = Issue("is empty: it has no face", "mesh-empty")
 UNITS_M = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 WRONG_UNIT, SUGGESTED = 1.6, 1.1  # units lie a factor of 2.5 apart; one that makes the size right to a tenth is named
 SAME_RIM, SAME_END = 0.1, 0.25  # of the rim's radius, of the centerbody's length

@@ -24,7 +24,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, create_model
 
-from flightmodel.checks import Fault, FloatArray
+from flightmodel.checks import FloatArray, Issue
 from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFault, Place, Section
 from flightmodel.earth import undulation_m
 from flightmodel.tables import Declared, Source, Thinning
@@ -586,12 +586,12 @@ class Mounted(Source):
             dcm = self.dcm_body_sensor
             if not np.allclose(dcm @ dcm.T, np.eye(3)):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
-                yield "axes", list(self.axes), Fault(words, "axes-parallel")
+                yield "axes", list(self.axes), Issue(words, "axes-parallel")
             elif np.linalg.det(dcm) < 0.0:
                 words = (
                     "left-handed axes (a mirror image): change a sign, swap two, or give one column a unit as -degps"
                 )
-                yield "axes", list(self.axes), Fault(words, "axes-left-handed")
+                yield "axes", list(self.axes), Issue(words, "axes-left-handed")
         elif self.position_from_datum_body_m is not None and self.mount != "body":
             words = 'goes with axes = ["+x", "+y", "+z"] or mount = "body"; a package of the vehicle has its own place'
             yield "position_from_datum_body_m", list(self.position_from_datum_body_m), words

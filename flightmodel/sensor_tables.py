@@ -28,7 +28,7 @@ from flightmodel.atmosphere import (
     profile_from_sounding,
 )
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.entry_state import fixed_axes
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault, working_camera
@@ -59,7 +59,6 @@ from flightmodel.instruments import (
 )
 from flightmodel.telemetry import (
     BarometerRecord,
-    Finding,
     GnssRecord,
     RadarRecord,
     Sounding,
@@ -176,7 +175,7 @@ def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> B
         if not enough.all():
             what = "satellites" if short == "nsat" else "mode"
             words = f"{int((~enough).sum())} of {len(enough)} fixes have {what} below {count} and are left out"
-            gate.findings.append(Finding(name, words, np.nan, np.nan, code="fixes-poor"))
+            gate.findings.append(Issue(words, "fixes-poor", name))
         good &= enough
     if good.sum() < 2:
         gate.refuse(
@@ -192,7 +191,7 @@ def _new_fixes(values: FloatArray) -> BoolArray:
     return np.append(True, ~same.all(axis=1) | np.isnan(values[1:]).all(axis=1))
 
 
-def _held(name: str, time_s: FloatArray, new: BoolArray) -> Finding:
+def _held(name: str, time_s: FloatArray, new: BoolArray) -> Issue:
     """Say that a log writes the receiver's last fix until the next: it is one measurement, of its first row's time."""
     first = np.flatnonzero(new)
     held = time_s[np.append(first[1:], len(new)) - 1] - time_s[first]
@@ -201,7 +200,7 @@ def _held(name: str, time_s: FloatArray, new: BoolArray) -> Finding:
         f"{int((~new).sum())} of {len(new)} rows hold the fix of the row before and are left out, for up to "
         f"{held[k]:.3g} s: a fix counts once, at the time of its first row"
     )
-    return Finding(name, words, float(time_s[first[k]]), float(time_s[first[k]] + held[k]), code="fixes-held")
+    return Issue(words, "fixes-held", name, float(time_s[first[k]]), float(time_s[first[k]] + held[k]))
 
 
 def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet) -> FloatArray | None:
@@ -264,7 +263,7 @@ def _note_geoid(gate: Gate, name: str, source: Heights, undulation_m: FloatArray
         low, high = np.nanmin(undulation_m), np.nanmax(undulation_m)
         size = f"{low:.1f} m" if high - low < 0.1 else f"{low:.1f} to {high:.1f} m"
         words = f"heights above mean sea level became ellipsoidal with EGM96's undulation, {size}"
-        gate.findings.append(Finding(name, words, np.nan, np.nan, code="undulation-by-model"))
+        gate.findings.append(Issue(words, "undulation-by-model", name))
 
 
 def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
@@ -346,7 +345,7 @@ def read_barometer(
             words += (
                 "; near and above the speed of sound a port does not measure static pressure: use_s can leave that out"
             )
-        gate.findings.append(Finding(name, words, np.nan, np.nan, code="heights-from-pressure"))
+        gate.findings.append(Issue(words, "heights-from-pressure", name))
     else:
         height = table.columns["height"]
     undulation = source.to_ellipsoid_m(*place)
@@ -545,7 +544,7 @@ def _reduced(gate: Gate, label: str, frames: Frames) -> Frames:
     if camera.size_px == filed_px:
         return frames
     words = f"pictures of {filed_px[0]} x {filed_px[1]} pixels, read at {camera.width_px} x {camera.height_px}"
-    gate.findings.append(Finding(label, words, np.nan, np.nan, "pictures-reduced"))
+    gate.findings.append(Issue(words, "pictures-reduced", label))
     edits = frames.edits.resized(filed_px, camera.size_px)
     return replace(frames, camera=camera, edits=edits, filed_px=filed_px)
 
@@ -566,7 +565,7 @@ def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, vehicle: Vehic
         gate.faults.extend(f for f in fault.faults if f not in gate.faults)  # of several cameras each reads the table
         return NO_EDITS
     if edits.rows:
-        gate.findings.append(Finding(label, f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand"))
+        gate.findings.append(Issue(f"edits by hand ({EDITS_FILE}): {edits}", "edited-by-hand", label))
     return edits
 
 
@@ -610,10 +609,10 @@ def _film_numbers(
     again = int((np.diff(numbers) == 0).sum())
     if again:
         words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
-        gate.findings.append(Finding(label, words, np.nan, np.nan, code="frame-repeated"))
+        gate.findings.append(Issue(words, "frame-repeated", label))
     timing = film_timing_fault(film)
     if timing:
-        gate.findings.append(Finding(label, f"{film.name}: {timing}", np.nan, np.nan, timing.code))
+        gate.findings.append(Issue(f"{film.name}: {timing}", timing.code, label))
     return numbers
 
 
@@ -625,7 +624,7 @@ WHOLE = 0.75  # part of a block's samples that its mean needs
 _LEAST_LEVELS, _MOST_LEVELS = 5, 0.5
 
 
-def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Issue]]:
     """Means of blocks at about 1 kHz of a record of more than 2 kHz, and a finding; other records as they are.
 
     Noise and resolution of the record's data sheet become those of a mean. A record whose rate changes is left as it
@@ -646,10 +645,10 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
         record.spec, noise_sd=record.spec.noise_sd / np.sqrt(count), resolution=record.spec.resolution / np.sqrt(count)
     )
     words = f"{len(block)} samples at {1.0 / usual:.0f} Hz, of which means of {count} are used"
-    return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
+    return TriadRecord(spec, time_s, means), [Issue(words, "samples-averaged", spec.name)]
 
 
-def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Issue]]:
     """Record whose resolution is the least count that its readings show, and a finding, where that is not stated.
 
     Readings of a converter are whole multiples of one step. Left out are steps below the noise, which hides them.
@@ -658,7 +657,7 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     if step <= 1.1 * max(record.spec.noise_sd, record.spec.resolution):
         return record, []
     words = f"readings are multiples of {step:.3g} (SI), more than noise and resolution state: taken for resolution"
-    finding = Finding(record.spec.name, words, np.nan, np.nan, code="least-count")
+    finding = Issue(words, "least-count", record.spec.name)
     return replace(record, spec=replace(record.spec, resolution=step)), [finding]
 
 
@@ -722,7 +721,7 @@ def _winds(gate: Gate, table: Table, planet: earth.Planet) -> tuple[FloatArray, 
         return c["wind_north"], c["wind_east"]
     if {"wind_speed", "wind_from"} <= set(c):
         words = "wind is given by where it comes from: converted to the velocity of the air mass"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-converted"))
+        gate.findings.append(Issue(words, "wind-direction-converted", SOURCE))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
     if planet != earth.WGS84 and not {"wind_north", "wind_east", "wind_speed", "wind_from"} & set(c):
         still = np.zeros(len(table.lines))  # no wind is known there but by models
@@ -756,7 +755,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
     if not whole.all():
         k, count = int(np.argmin(whole)), int((~whole).sum())
         words = f"{count} rows with a missing value left out, the first at line {int(table.lines[k])}"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="rows-incomplete"))
+        gate.findings.append(Issue(words, "rows-incomplete", SOURCE))
     rows = np.flatnonzero(whole)[np.argsort(c["alt"][whole], kind="stable")]
     alt, rho, temperature = c["alt"][rows], c["rho"][rows], c["temperature"][rows]
     if len(rows) < 2:
@@ -768,16 +767,14 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
         return None
     if alt[-1] < LOWEST_TOP_M:
         words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
+        gate.findings.append(Issue(words, "sounding-short", SOURCE))
     pressure = rho * gas_constant(alt, planet) * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
             k = int(rows[int(np.nanargmax(off))])
             words = f"pressure departs from density and temperature by {100 * np.nanmax(off):.0f} % at line "
-            gate.findings.append(
-                Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan, code="gas-law")
-            )
+            gate.findings.append(Issue(f"{words}{int(table.lines[k])}; density is used", "gas-law", SOURCE))
     out_of_balance = hydrostatic_error(alt, pressure, temperature) if planet == earth.WGS84 else 0.0
     if abs(out_of_balance) > HYDROSTATIC_TOLERANCE:
         size, side = 100.0 * abs(out_of_balance), "high" if out_of_balance > 0.0 else "low"
@@ -785,7 +782,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
             f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic "
             "balance): check the units of all three"
         )
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
+        gate.findings.append(Issue(words, "hydrostatic-balance", SOURCE))
     density_sd, wind_sd = default_sounding_sd(alt, planet)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:

@@ -37,7 +37,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 from scipy import constants
 
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.config import KeyFault, Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
@@ -374,12 +374,12 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
         )
     names, counts = _cells(numbered)
     head = f"{label}: {path}: line {numbered[0][0]}"
-    faults = [Fault(f"{head}: column '{n}' stands twice", "column-twice") for n in _twice(names)]
+    faults = [Issue(f"{head}: column '{n}' stands twice", "column-twice") for n in _twice(names)]
     ragged = np.flatnonzero(counts != len(names))
     if len(ragged):
         k = int(ragged[0])
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
                 f"({len(ragged)} in all); mend or remove them",
                 "row-ragged",
@@ -427,7 +427,7 @@ def line_of(frame: pd.DataFrame, row: int) -> int:
     return int(frame.attrs["lines"][row])
 
 
-def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
+def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[Issue]) -> FloatArray:
     """Column as float64; empty and NaN cells are missing, any other text is a fault with its file line."""
     import pandas as pd
 
@@ -440,7 +440,7 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
         where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
         count = f"({int(bad.sum())} in all)"
         faults.append(
-            Fault(
+            Issue(
                 f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty",
                 "not-a-number",
             )
@@ -490,7 +490,7 @@ def column_si(
     declared: Declared | None,
     path: Path,
     label: str,
-    faults: list[str],
+    faults: list[Issue],
 ) -> FloatArray | None:
     """Return a quantity in SI, or None where it is absent (a fault when it is required)."""
     column, unit = place(quantity, declared)
@@ -501,7 +501,7 @@ def column_si(
     if not fits(quantity, unit):
         fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}",
                 "unit-unknown",
             )
@@ -510,7 +510,7 @@ def column_si(
     return to_si(numbers(frame, column, path, label, faults), unit)
 
 
-def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
+def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> Issue:
     stem = column.rsplit("_", 1)[0]
     bare = [c for c in frame.columns if c.lower() in (stem.lower(), quantity.short.lower())]
     if bare:
@@ -521,11 +521,11 @@ def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, la
     else:
         hint = nearest_name(column, frame.columns)
     words = f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
-    return Fault(words, "table-column-missing")
+    return Issue(words, "table-column-missing")
 
 
 def unordered_times_s(
-    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[Issue]
 ) -> FloatArray | None:
     """Seconds after t0 in the file's order, or None with a fault for each thing that is wrong."""
     absent = [column for column in spec.parts if column not in frame.columns]
@@ -533,7 +533,7 @@ def unordered_times_s(
         found = ", ".join(frame.columns)
         hint = nearest_name(absent[0], frame.columns)
         faults.append(
-            Fault(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "table-column-missing")
+            Issue(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "table-column-missing")
         )
         return None
     if spec.format == "seconds":
@@ -548,15 +548,15 @@ def unordered_times_s(
         cell = ":".join(frame[column].iloc[first].strip() for column in spec.parts)
         where = f"{label}: {path}: line {line_of(frame, first)}: time '{cell}'"
         if _SECOND_60.search(cell):
-            faults.append(Fault(f"{where} {SECOND_60}", "second-60"))
+            faults.append(Issue(f"{where} {SECOND_60}", "second-60"))
         else:
-            faults.append(Fault(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
+            faults.append(Issue(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
         return None
     return values
 
 
 def times_s(
-    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[Issue]
 ) -> FloatArray | None:
     """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
     values = unordered_times_s(frame, spec, t0, path, label, faults)
@@ -567,7 +567,7 @@ def times_s(
     if back.any():
         k = int(np.argmax(back))
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s "
                 f"then {values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates",
                 "time-backwards",

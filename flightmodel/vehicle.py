@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flightmodel.aerodynamics import Aerodynamics, AeroTable, Coefficient, Shape, aerodynamics_from
-from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, check_type, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, Issue, check_positive_definite, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     ErrorAngle,
@@ -404,12 +404,12 @@ class Vehicle:
         ConfigError
             ``event-unknown``: a step names an event that is not among ``events``.
         """
-        times, faults, steps = dict(events), list[Fault](), list[MassStep]()
+        times, faults, steps = dict(events), list[Issue](), list[MassStep]()
         for step in self.mass_steps:
             if step.event is not None and step.event not in times:
                 hint = f"{nearest_name(step.event, list(times))}; known: {', '.join(times) or 'none'}"
                 words = f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}"
-                faults.append(Fault(words, "event-unknown"))
+                faults.append(Issue(words, "event-unknown"))
             else:
                 at_s = step.from_s if step.event is None else times[step.event]
                 steps.append(step.model_copy(update={"from_s": at_s, "event": None}))

@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.camera import Lens
-from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from postflight import run_folder, warmup
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
@@ -33,7 +33,6 @@ from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import return_large_arrays, write_out
 from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.terminal import few_of_each, progress_bar, terminal
-from recon.consistency import ConsistencyCheck
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -265,7 +264,7 @@ def _answered(
     answers = estimate(bet, wanted, step(0.7, 1.0), camera, second.time_bias)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
-        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+        answers.refused["camera"] = Issue("the flight has no video", NO_VIDEO)
     return bet, answers
 
 
@@ -317,7 +316,7 @@ def asked(
 ) -> Asked:
     """Read ``--set NAME=VALUE`` (the value as TOML writes it) and the other options; every fault at once."""
     changes: dict[str, Any] = {}
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     if run_name is not None:
         try:
             check_name(run_name)
@@ -326,9 +325,9 @@ def asked(
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and name):
-            faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+            faults.append(Issue(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
         elif name in changes:
-            faults.append(Fault(f"--set {text}: {name} is set twice; give it once", "set-twice"))
+            faults.append(Issue(f"--set {text}: {name} is set twice; give it once", "set-twice"))
         else:
             changes[name] = _toml_value(value)
     if faults:
@@ -375,7 +374,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         console.coded(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
 
 
-def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
+def print_checks(checks: tuple[Check, ...], of: str) -> None:
     """Print how many checks of something pass, and in red those that fail."""
     failed = [check for check in checks if not check.passed]
     console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")
@@ -492,7 +491,7 @@ def deflection(
         except (GateError, DivergenceError) as fault:
             if not alone:
                 raise
-            trouble = Fault(str(fault), fault.codes[0])
+            trouble = Issue(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
             run_folder.write_answers(out, answers)

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import ConfigError, Fault, GateError, Progress, check_path, nearest_name
+from flightmodel.checks import ConfigError, GateError, Issue, Progress, check_path, nearest_name
 from flightmodel.files import file_bytes
 from flightmodel.flightfolder import read_flight as read_telemetry
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import Finding, Sounding, Telemetry
+from flightmodel.telemetry import Sounding, Telemetry
 from flightmodel.vehicle import MassProperties, Vehicle
 from recon.settings import Settings
 
@@ -75,7 +75,7 @@ class Flight(Tabular):
         return self.telemetry.vehicle
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Issue, ...]:
         """What the gate found in the data: gaps, frozen and missing samples, repairs of row order."""
         return self.telemetry.findings
 
@@ -315,7 +315,7 @@ def _density(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
 
 def _attitude_prior(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     if value is not None:
-        raise GateError([Fault(f"assumption {name}: only None (no prior) can be assumed", "what-if-value")])
+        raise GateError([Issue(f"assumption {name}: only None (no prior) can be assumed", "what-if-value")])
     return replace(telemetry, attitude_prior=None)
 
 

@@ -33,11 +33,11 @@ if TYPE_CHECKING:  # the process decides first how pandas is loaded
     import pandas as pd
 
     from estimators.camera import FilmFit
+    from estimators.fusing import CameraTimeBias
     from postflight.deflections import Deflections
     from postflight.filming import CameraAnswer
     from postflight.flight import Flight
     from postflight.flown_coefficients import AeroIncrements
-    from postflight.fusing import CameraTimeBias
     from postflight.reconstruction import Reconstruction
     from postflight.studies.preflight import Bounds
 
@@ -247,7 +247,7 @@ def _camera(bet: Reconstruction | None, film: FilmFit | None) -> CameraAnswer | 
 
 
 def _time_bias(bet: Reconstruction, seen: CameraAnswer) -> CameraTimeBias | None:
-    from postflight.fusing import time_bias_if_free
+    from estimators.fusing import time_bias_if_free
 
     return time_bias_if_free(bet.required_loads(), seen.plain)
 

@@ -20,7 +20,7 @@ from flightmodel.checks import Progress
 from postflight.streams import into_nothing, visible
 
 if TYPE_CHECKING:  # a first line waits for no numpy
-    from flightmodel.telemetry import Finding
+    from flightmodel.checks import Issue
 
 
 class Terminal(Console):
@@ -48,15 +48,15 @@ def terminal(**options: Any) -> Terminal:
 MOST_ALIKE = 5  # findings of one kind that a reader wants line by line
 
 
-def few_of_each(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+def few_of_each(findings: Iterable[Issue]) -> list[tuple[str, str]]:
     """Words and code of findings; of many of one source and code the first, and how many more there are, until when."""
-    alike: dict[tuple[str, str], list[Finding]] = {}
+    alike: dict[tuple[str, str], list[Issue]] = {}
     for finding in findings:
         alike.setdefault((finding.source, finding.code), []).append(finding)
     out = []
     for (source, code), same in alike.items():
         shown = same if len(same) <= MOST_ALIKE else same[: MOST_ALIKE - 1]
-        out += [(str(finding), code) for finding in shown]
+        out += [(finding.line, code) for finding in shown]
         if len(shown) < len(same):
             until = f", the last until {same[-1].end_s:.3f} s" if math.isfinite(same[-1].end_s) else ""
             out.append((f"{source}: {len(same) - len(shown)} more of these{until}", code))

@@ -45,12 +45,12 @@ from flightmodel.atmosphere import (
     sounding_correlation,
     unresolved_variance,
 )
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError
 from flightmodel.statistics import correlation
 from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.consistency import data_sheet_check
 from recon.reconstruct import TrajectorySolution
 
 # a third of the winds' correlation length, a quarter of the trajectory's time
@@ -156,13 +156,13 @@ class ReconstructedAir:
     parameters : DataFrame
         ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets. Scales are logs of flown over
         stated coefficient over mass, C_A's the mean over the pressure pulse.
-    consistency_checks : tuple of ConsistencyCheck
+    consistency_checks : tuple of Check
     """
 
     profile: pd.DataFrame
     drag: pd.DataFrame
     parameters: pd.DataFrame
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    consistency_checks: tuple[Check, ...]
 
 
 _PARAMETERS = {
@@ -423,13 +423,13 @@ def _drag_ratio(model: _Model) -> pd.DataFrame:
     )
 
 
-def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
+def _residual_checks(residual: FloatArray) -> list[Check]:
     """Do the forces follow the model (n, 3)?"""
     out = []
     for name, part in (("axial", residual[:, :1]), ("lateral", residual[:, 1:])):
         rms = float(np.sqrt(np.mean(part**2)))
         out.append(
-            consistency_check(
+            Check.of(
                 "force-residuals", f"air residuals {name}", rms, 0.0, _LARGEST_RMS, "forces follow the model",
                 "forces do not follow the model", advice="check coefficients, and for forces other than aerodynamic",
                 source="air", component=name,
@@ -440,7 +440,7 @@ def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
 
 def _consistency_checks(
     height: FloatArray, estimate: FloatArray, sd: FloatArray, ca: tuple[float, float], confidence: float
-) -> tuple[ConsistencyCheck, ...]:
+) -> tuple[Check, ...]:
     """Are density, winds and C_A (estimate and sd over its a priori sd) consistent with sounding and vehicle file?"""
     k = len(height)
     heights = [f"at {h / 1000:.0f} km" for h in height]
@@ -448,7 +448,7 @@ def _consistency_checks(
 
     def check(
         code: str, label: str, names: list[str], found: FloatArray, found_sd: FloatArray, bad: str
-    ) -> ConsistencyCheck | None:
+    ) -> Check | None:
         good = "within stated uncertainty; largest:"
         return data_sheet_check(code, label, "", names, found, np.ones(len(names)), found_sd, confidence, bad, good)
 

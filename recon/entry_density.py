@@ -45,10 +45,9 @@ from flightmodel.atmosphere import (
     sound_speed,
     standard_air,
 )
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem
 from recon.propagation import Motion
 from recon.state import KINEMATIC, States, unpacked
@@ -244,7 +243,7 @@ def _mean(
     return weight * flown + (1.0 - weight) * stated, np.sqrt(1.0 - weight) * stated_sd
 
 
-def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check the density by the drag against the stated atmosphere, by the error of both and of the height.
 
     With neither tracker nor gyros this alone shows a radius for a diameter or a height that is 20 km off.
@@ -259,7 +258,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None of an empty table.
     """
     if table.empty:
@@ -275,7 +274,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
     sd = np.sqrt(sum(part**2 for part in parts))
     layer = _worst_layer(height, np.log(table["density_ratio"]).to_numpy(), np.asarray(sd), confidence)
     found = f"density at {layer.between} is {np.exp(layer.mean):.2g} times the stated atmosphere's"
-    return consistency_check(
+    return Check.of(
         "sounding-density", "sounding density", layer.away, 0.0, layer.most, f"{found}, within what both may err",
         found,
         advice="the air differed, or mass, area or C_A of [drag], height or speed of the stated state, or the "
@@ -283,7 +282,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
     )  # fmt: skip
 
 
-def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check the temperature by the weight of the air above against the stated one, by the errors of both.
 
     It is of another kind than density: a factor of the drag is not in it, but a deceleration that is too small, or rows
@@ -300,7 +299,7 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None of an empty table.
     """
     if table.empty:
@@ -314,7 +313,7 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
     sd = np.hypot(own * usual, stated.temperature_sd(height))
     layer = _worst_layer(height, (flown - usual).to_numpy(), np.asarray(sd), confidence)
     found = f"temperature by the drag at {layer.between} is {layer.mean:+.0f} K from the stated atmosphere's"
-    return consistency_check(
+    return Check.of(
         "sounding-temperature", "sounding temperature", layer.away, 0.0, layer.most,
         f"{found}, within what both may err", found,
         advice="scale or axis of the accelerometer, rows that are missing with their time, axes, angles and speed of "
@@ -348,7 +347,7 @@ def _worst_layer(height_m: FloatArray, off: FloatArray, sd: FloatArray, confiden
     return _Layer(float(layers["off"].iloc[worst]), float(shift[worst]), float(most[worst]), between)
 
 
-def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check that the density by the drag does not jump, as where a parachute opens or a part separates.
 
     Means over a second are compared with those two seconds before, or before a gap, since the filter rejects the first
@@ -366,7 +365,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None where no two means are two seconds apart or more.
     """
     log_ratio = np.log(table["density_ratio"])
@@ -392,7 +391,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     worst = int(np.argmax(np.abs(jump)))
     when = f"from {before.index[worst]} to {after.index[worst]} s"
     found = f"{np.exp(change[worst]):.2g} times the stated atmosphere's change {when}"
-    return consistency_check(
+    return Check.of(
         "drag-jump", "density by the drag does not jump", float(np.abs(jump[worst])), 0.0,
         float(-ndtri(0.5 * (1.0 - confidence) / len(last))), f"{found}, as air may", found,
         advice="a parachute opened, a part separated or the reading jumped: leave out what follows by use_s, or state "

@@ -43,10 +43,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, IntArray
-from flightmodel.telemetry import Finding
+from flightmodel.checks import Check, DivergenceError, FloatArray, IntArray, Issue
 from recon import _glr_kernels
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Innovations, Problem
 from recon.imu_screening import TransientOffset
 
@@ -121,20 +119,20 @@ class UnmodelledAcceleration:
     end_s: float
     density: float
 
-    def finding(self) -> Finding:
+    def finding(self) -> Issue:
         """Finding that names its size."""
         gained = np.sqrt(self.density * (self.end_s - self.start_s))
         remark = (
             f"unmodelled acceleration: about {gained:.2g} m/s of velocity along each axis that neither sensors nor the "
             "motion model explain; check for staging, thrust, a parachute or a saturated sensor"
         )
-        return Finding("motion", remark, self.start_s, self.end_s, UNMODELLED_CODE)
+        return Issue(remark, UNMODELLED_CODE, "motion", self.start_s, self.end_s)
 
 
-def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> ConsistencyCheck:
+def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> Check:
     """Whether accelerometer and gyros carry the track without any acceleration that they did not measure."""
     where = ", ".join(f"{d.start_s:.1f} to {d.end_s:.1f} s" for d in spans)
-    return consistency_check(
+    return Check.of(
         UNMODELLED_CODE, "sensors carry the track", len(spans), 0.0, 0.0, "accelerometer and gyros carry the track",
         f"an acceleration that they did not measure is needed to follow the track ({where})",
         advice="trackers that lag (time tags, a receiver beyond its dynamics), or sensors that saturate: correct or "

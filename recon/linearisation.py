@@ -29,10 +29,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, IntArray
+from flightmodel.checks import Check, FloatArray, IntArray
 from recon import ekf, propagation, setup, single_faults, smoother
 from recon._measurement_kernels import DECELERATION
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem, with_servo_lag
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 from recon.settings import Settings
@@ -70,11 +69,11 @@ class SpinPhase:
     prior_sd_rad: float
     odds: float
 
-    def check(self) -> ConsistencyCheck:
+    def check(self) -> Check:
         """Is one phase far likelier than all others?"""
         prior = f"the gyros' scale and bias leave {np.rad2deg(self.prior_sd_rad):.0f} deg (1 sd) of rotation open"
         odds = f"odds of one phase over the next {np.exp(self.odds):.0f} to 1" if self.odds < 14.0 else "one phase fits"
-        return consistency_check(
+        return Check.of(
             "spin-phase", "phase of the spin", self.odds, _LEAST_ODDS, np.inf, f"{prior}; {odds}", f"{prior}; {odds}",
             advice="another number of turns explains the data as well: state a later attitude, a surer scale, or use "
             "magnetometer and Sun sensors (attitude_sensors)", source="rates", component="scale",

@@ -41,10 +41,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, Check, FloatArray
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.fault_detection import LOG_LIKELIHOOD_LIMIT
 from recon.imu_screening import BridgedSensor
 from recon.time_bias import CORRELATION_S, SLOWEST_S, has_gap, smoothed_body_axes
@@ -330,7 +329,7 @@ def common_angle(near: float, logs: FloatArray, step: float) -> tuple[float, flo
     return float(near + weight @ off / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) -> ConsistencyCheck:
+def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) -> Check:
     """Whether both sensors have one set of axes, as far as the oscillation shows it."""
     names = f"{force.spec.name} and {rate.spec.name}"
     off = found.kind in (ROLL, MIRRORED)
@@ -344,14 +343,5 @@ def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) ->
         bad += rate.spec.name
         advice = "check the mount and the column order of both"
     value = max(found.gain, LOG_LIKELIHOOD_LIMIT + 1.0) if off else 0.0
-    return consistency_check(
-        "triads-axes",
-        f"axes of {names}",
-        value,
-        0.0,
-        LOG_LIKELIHOOD_LIMIT,
-        good,
-        bad,
-        advice=advice,
-        component=found.kind,
-    )
+    limits, kind = (0.0, LOG_LIKELIHOOD_LIMIT), found.kind
+    return Check.of("triads-axes", f"axes of {names}", value, *limits, good, bad, advice=advice, component=kind)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictStr, TypeAdapter, ValidationError
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.tables import ordered_spans
 
 COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.ekf` and `recon.smoother`
@@ -116,7 +116,7 @@ class Settings:
             except ValidationError:
                 shown, code = f"'{value}'" if isinstance(value, str) else f"{value}", setting.metadata["code"]
                 known = allowed.removeprefix("one of ").split(", ") if code == "setting-choice" else ()
-                faults.append(Fault(f"{setting.name} {shown}{nearest_name(str(value), known)} must be {allowed}", code))
+                faults.append(Issue(f"{setting.name} {shown}{nearest_name(str(value), known)} must be {allowed}", code))
         if faults:
             raise ConfigError(faults)
 
@@ -131,7 +131,7 @@ class Settings:
         """
         names = [setting.name for setting in fields(cls)]
         faults = [
-            Fault(
+            Issue(
                 f"[reconstruction] {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
                 "setting-unknown",
             )
@@ -141,7 +141,7 @@ class Settings:
         try:
             chosen = cls(**{key: value for key, value in values.items() if key in names})  # type: ignore[arg-type]
         except ConfigError as wrong:
-            faults += [Fault(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
+            faults += [Issue(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
         if faults:
             raise ConfigError(faults)
         return chosen

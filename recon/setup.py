@@ -18,7 +18,7 @@ from types import MappingProxyType
 import numpy as np
 
 from flightmodel import geomagnetism_and_sun, rotations
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.earth import Planet
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
@@ -180,7 +180,7 @@ def _named_model(
     faults = _unknown_sources(telemetry, settings, trackers)
     if settings.attitude_sensors and sensors is None:
         remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
-        faults.append(Fault(remark, "setting-not-applicable"))
+        faults.append(Issue(remark, "setting-not-applicable"))
     model = _build_error_model(telemetry, sensors, settings.attitude_sensors)
     try:
         model = model.considering(settings.consider)
@@ -198,13 +198,13 @@ def check_sources(telemetry: Telemetry, settings: Settings) -> None:
         raise ConfigError(faults)
 
 
-def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[Instrument, ...]) -> list[Fault]:
+def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[Instrument, ...]) -> list[Issue]:
     known = sorted({name for i in trackers for name in (i.name, i.owner)})
     if settings.attitude_sensors:
         known += ["magnetometer"] if telemetry.magnetometer is not None else []
         known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
     return [
-        Fault(
+        Issue(
             f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
         )
         for name in settings.without

@@ -22,9 +22,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import Finding, Telemetry
-from recon.consistency import ConsistencyCheck, consistency_check
+from flightmodel.checks import Check, FloatArray, GateError, Issue
+from flightmodel.telemetry import Telemetry
 from recon.ekf import ForwardPass, Problem
 from recon.single_faults import Single, SingleFault, log_likelihood
 from recon.state import States
@@ -131,7 +130,7 @@ def lags(telemetry: Telemetry, faults: tuple[SingleFault, ...], sensor_errors: p
 
 def judged_by_the_stated(
     telemetry: Telemetry, late_s: Mapping[str, float], sensor_errors: pd.DataFrame, confidence: float
-) -> tuple[list[ConsistencyCheck], list[Finding], pd.DataFrame]:
+) -> tuple[list[Check], list[Issue], pd.DataFrame]:
     """Checks and findings of the tags that were set back, and errors of the tags as delivered."""
     checks, findings, table = [], [], sensor_errors.set_index("name")
     limit = float(ndtri(0.5 * (1.0 + confidence)))
@@ -140,13 +139,13 @@ def judged_by_the_stated(
         whole_s, sd_s = moved_s + float(table.estimate[error]), float(table.sd[error])
         stated_s = record.spec.time_bias_sd_s
         symptom = f"{name}: time tags {_in_words(whole_s)} ± {sd_s:.3f}, set right"
-        made = consistency_check(
+        made = Check.of(
             "tracker-time", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
             advice=f"more than stated (time_bias_sd_s = {stated_s:g}); or the inertial sensors' tags, and with them "
             "the trajectory's, are off as much the other way: check both", source=name, component="time bias",
         )  # fmt: skip
         checks.append(made)
-        findings.append(Finding(name, symptom, float(record.time_s[0]), float(record.time_s[-1]), "clock-corrected"))
+        findings.append(Issue(symptom, "clock-corrected", name, float(record.time_s[0]), float(record.time_s[-1])))
         table.loc[error, ["prior_sd", "estimate"]] = stated_s, whole_s
     return checks, findings, table.reset_index()
 

@@ -25,9 +25,9 @@ import pandas as pd
 from scipy.special import ndtri
 
 from flightmodel import earth, rotations
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, IntArray, Issue
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
+from flightmodel.telemetry import AttitudePrior, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from recon.attitude_smoother import (
     ErrorTerms,
@@ -43,7 +43,7 @@ from recon.attitude_smoother import (
     solve_vectors,
     unit,
 )
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.consistency import data_sheet_check
 
 _QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
@@ -90,8 +90,8 @@ class AttitudeHistory:
     rate_body_radps : (n, 3) float
         Of the body against inertial space, body axes.
     method : str
-    findings : tuple of Finding
-    consistency_checks : tuple of ConsistencyCheck
+    findings : tuple of Issue
+    consistency_checks : tuple of Check
         Residuals and constant errors of each sensor against its data sheet.
     sensor_errors : DataFrame
         ``name, unit, prior_sd, estimate, sd`` (SI).
@@ -104,8 +104,8 @@ class AttitudeHistory:
     covariance: FloatArray
     rate_body_radps: FloatArray
     method: str
-    findings: tuple[Finding, ...]
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    findings: tuple[Issue, ...]
+    consistency_checks: tuple[Check, ...]
     sensor_errors: pd.DataFrame
     observations: tuple[VectorObservations, ...]
 
@@ -229,9 +229,7 @@ def _solve_each(name: str, observations: list[VectorObservations], count: int) -
     return both[sharp], rotations.continuous(q[sharp])
 
 
-def _bridged(
-    knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings
-) -> tuple[BoolArray, list[Finding]]:
+def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings) -> tuple[BoolArray, list[Issue]]:
     """Knots to solve at: between those with an attitude, less gaps too long to be bridged, which are findings."""
     step = np.diff(knots_s[solved])
     rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
@@ -244,7 +242,7 @@ def _bridged(
         keep[solved[k] + 1 : solved[k + 1]] = False
         remark = f"no attitude for {step[k]:.1f} s: field or Sun missing, and up to {longest:.1f} s can be bridged"
         span = float(knots_s[solved[k]]), float(knots_s[solved[k + 1]])
-        found.append(Finding("attitude check", remark, *span, "attitude-gap"))
+        found.append(Issue(remark, "attitude-gap", "attitude check", *span))
     return keep, found
 
 
@@ -255,23 +253,21 @@ def _renumbered(observed: VectorObservations, keep: BoolArray) -> VectorObservat
 
 def _fit_findings(
     fit: Fit, before: list[VectorObservations], after: list[VectorObservations], knots: Knots
-) -> list[Finding]:
+) -> list[Issue]:
     ends = float(knots.time_s[0]), float(knots.time_s[-1])
     kept = {observed.name: len(observed.knot) for observed in after}
     found = [
-        Finding(
-            observed.name,
+        Issue(
             f"{len(observed.knot) - kept[observed.name]} blocks edited from the attitude check",
-            *ends,
             "blocks-edited",
+            observed.name,
+            *ends,
         )
         for observed in before
         if len(observed.knot) > kept.get(observed.name, len(observed.knot))
     ]
     if not fit.converged:
-        found.append(
-            Finding("attitude check", f"not converged after {fit.steps} steps", *ends, "attitude-not-converged")
-        )
+        found.append(Issue(f"not converged after {fit.steps} steps", "attitude-not-converged", "attitude check", *ends))
     return found
 
 
@@ -280,7 +276,7 @@ def _history(
     fit: Fit,
     terms: ErrorTerms,
     used: list[VectorObservations],
-    findings: list[Finding],
+    findings: list[Issue],
     settings: Settings,
 ) -> AttitudeHistory:
     sd = np.sqrt(np.diagonal(fit.error_covariance))
@@ -300,26 +296,21 @@ def _history(
     )
 
 
-def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[ConsistencyCheck]:
+def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Check]:
     """Of each sensor its residuals, and its constant errors against its data sheet."""
 
-    out: list[ConsistencyCheck] = []
+    out: list[Check] = []
     tail = 0.5 * (1.0 - confidence)
     for name, (squares, expected) in fit.misfit.items():
         low, high = (chi_square_quantile(p, expected) / expected for p in (tail, 1.0 - tail))
         out.append(
-            consistency_check(
-                "attitude-residuals",
-                f"residuals {name}",
-                squares / expected,
-                float(low) - _MISFIT_ALLOWANCE,
-                float(high) + _MISFIT_ALLOWANCE,
-                f"{name}: residuals as large as its noise",
+            Check.of(
+                "attitude-residuals", f"residuals {name}", squares / expected, float(low) - _MISFIT_ALLOWANCE,
+                float(high) + _MISFIT_ALLOWANCE, f"{name}: residuals as large as its noise",
                 f"{name}: residuals are not as large as its noise",
-                advice="check noise, clocking and interference",
-                source=name,
+                advice="check noise, clocking and interference", source=name,
             )
-        )
+        )  # fmt: skip
     sd = np.sqrt(np.diagonal(fit.error_covariance))
     for name in dict.fromkeys(terms.instruments):
         own = terms.of(name)

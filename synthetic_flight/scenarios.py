@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, check_type, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     Duration,
@@ -223,7 +223,7 @@ def read_scenario(name: str | Path) -> Scenario:
     path = path_of("scenario", str(name), "scenario-unknown")
     tables = read_toml(path)
     spec, vehicle = None, None
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     try:
         spec = parse_section(ScenarioFile, tables, str(path))
     except ConfigError as fault:
@@ -242,7 +242,7 @@ def read_scenario(name: str | Path) -> Scenario:
     raise ConfigError(faults)
 
 
-def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fault]:
+def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Issue]:
     """Return which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
     packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
     faults = []
@@ -254,7 +254,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fa
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
             message = f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}"
-            faults.append(Fault(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
+            faults.append(Issue(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
     return faults
 
 

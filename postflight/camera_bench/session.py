@@ -25,7 +25,7 @@ from estimators.frame_solution import FrameFit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
-from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
+from flightmodel.checks import NO_FAULT, FloatArray, GateError, Issue
 from flightmodel.files import file_bytes
 from flightmodel.film import Frames
 from flightmodel.vehicle import Vehicle
@@ -41,7 +41,7 @@ class _Work:
 
     frames: Frames
     oriented: OrientedCamera | None
-    trouble: Fault
+    trouble: Issue
     fits: dict[int, FrameFit]
 
 
@@ -231,7 +231,7 @@ class Session:
         try:
             oriented = orient_on_film(frames, self.vehicle)
         except GateError as fault:
-            return _Work(frames, None, Fault(str(fault), fault.codes[0]), {})
+            return _Work(frames, None, Issue(str(fault), fault.codes[0]), {})
         return _Work(frames, oriented, NO_FAULT, {})
 
     def _fit_all(self) -> None:
@@ -291,7 +291,7 @@ def _answer_json(fit: FrameFit) -> dict[str, Any]:
     return out
 
 
-def _said(fault: Fault) -> dict[str, str] | None:
+def _said(fault: Issue) -> dict[str, str] | None:
     return {"words": str(fault), "code": fault.code} if fault else None
 
 

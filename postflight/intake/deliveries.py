@@ -33,7 +33,7 @@ from rich.table import Table
 
 from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import read_toml
 from flightmodel.files import file_bytes, write_file, writing
 from flightmodel.film import start_fault
@@ -406,7 +406,7 @@ class _Delivery:
     daveml: dict[Path, bytes] = field(default_factory=dict)
     files: dict[Path, bytes | str] = field(default_factory=dict)
     vehicle: dict[Path, str] = field(default_factory=dict)
-    skipped: list[Fault] = field(default_factory=list)
+    skipped: list[Issue] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -487,17 +487,17 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
         video = _video_of(file, folder / "telemetry")
         if video is not None:
             if video.is_film and (fault := start_fault(file)):
-                faults.append(Fault(f"{file}: {fault}", fault.code))
+                faults.append(Issue(f"{file}: {fault}", fault.code))
             came.videos.append(video)
             came.skipped += _beside_pictures(file, video)
         elif file.is_dir():
             words = f"{file}: a folder without pictures; name the files in it: {file / '*'}"
-            came.skipped.append(Fault(words, "nothing-to-import"))
+            came.skipped.append(Issue(words, "nothing-to-import"))
         elif file.suffix.lower() in _DAVEML:
             came.daveml[file] = _bytes_of(file)
         elif file.suffix.lower() in _PICTURES:
             words = f"{file}: a picture alone; name the folder that holds a video's pictures"
-            came.skipped.append(Fault(words, "nothing-to-import"))
+            came.skipped.append(Issue(words, "nothing-to-import"))
         else:
             try:
                 came.tables += read_tables(file)
@@ -518,12 +518,12 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     return came
 
 
-def _beside_pictures(folder: Path, video: Video) -> list[Fault]:
+def _beside_pictures(folder: Path, video: Video) -> list[Issue]:
     if video.is_film:
         return []
     others = sorted(p.name for p in folder.iterdir() if p.name not in video.names)
     words = f"{folder}: beside its pictures {', '.join(others[:5])}{' ...' if others[5:] else ''}"
-    return [Fault(words, "no-picture")] if others else []
+    return [Issue(words, "no-picture")] if others else []
 
 
 def _bytes_of(file: Path) -> bytes:
@@ -579,7 +579,7 @@ def _place(folder: Path, table: FreeFormTable) -> Path:
 
 def _proposals(
     came: _Delivery, places: list[Path], folder: Path, tables: dict[str, Any]
-) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Fault]]:
+) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Issue]]:
     """Text to add to flight.toml, what to print, and what of the tables is not used, with why."""
     taken = _sections(tables)
     added, shown, unrecognised, unused_tables = [], [], [], []
@@ -599,7 +599,7 @@ def _proposals(
         for source in found:
             if source.section in taken:
                 words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
-                unused_tables.append(Fault(words, "second-of-its-kind"))
+                unused_tables.append(Issue(words, "second-of-its-kind"))
             added.append(section_text(source, file, table.notes, source.section in taken))
             taken.add(source.section)
     listed = "".join(added)
@@ -609,12 +609,12 @@ def _proposals(
     return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown, unused_tables
 
 
-def _not_recognised(table: FreeFormTable, file: str) -> Fault:
+def _not_recognised(table: FreeFormTable, file: str) -> Issue:
     recogniser = Recogniser(table)
     if recogniser.is_sounding():
         without = _missing_of_a_radiosonde({q.short: m for q, m in recogniser.air_columns().items()}) or "three levels"
         words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
-        return Fault(words, "sounding-incomplete")
+        return Issue(words, "sounding-incomplete")
     if recogniser.time is None:
         first = [(name, cells[0]) for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
         shown = ", ".join(f"'{name}' {cell}" for name, cell in first)
@@ -622,9 +622,9 @@ def _not_recognised(table: FreeFormTable, file: str) -> Fault:
             f"{file}: no column of times is recognised, and without one nothing else is (the first row has {shown}); "
             "docs/own-data.md lists the times that are read; or declare its columns in flight.toml"
         )
-        return Fault(words, "not-recognised")
+        return Issue(words, "not-recognised")
     words = f"{file}: nothing recognised among {', '.join(table.names)}; declare its columns in flight.toml"
-    return Fault(words, "not-recognised")
+    return Issue(words, "not-recognised")
 
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:

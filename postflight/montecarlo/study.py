@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from flightmodel.airdata import air_data
-from flightmodel.checks import NO_FAULT, ConfigError, Fault, nearest_name
+from flightmodel.checks import NO_FAULT, ConfigError, Issue, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
@@ -181,7 +181,7 @@ def read_study(name: str) -> Study:
     spec = parse_section(DispersionsFile, read_toml(path), str(path))
     own = path.parent / spec.scenario
     scenario = read_scenario(str(own) if spec.scenario.endswith(".toml") else spec.scenario)
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     known = TRIAL_SCALARS if spec.mode == "whole" else SCALARS
     histories = () if spec.mode == "whole" else tuple(QUANTITIES)
     for key, names, allowed in (
@@ -192,21 +192,21 @@ def read_study(name: str) -> Study:
         try:
             check_outputs(names, allowed)
         except ConfigError as fault:
-            faults += [Fault(f"{path}: key '{key}': {words}", words.code) for words in fault.faults]
+            faults += [Issue(f"{path}: key '{key}': {words}", words.code) for words in fault.faults]
     if spec.mode == "whole":
-        faults += [Fault(f"{path}: {words}", words.code) for words in impossible_dispersions(spec)]
+        faults += [Issue(f"{path}: {words}", words.code) for words in impossible_dispersions(spec)]
     try:
         legs(scenario.spec.time, spec.window, spec.joint_is == "locked")
         if spec.window.step_s is not None and spec.joint_is == "flexible":
             check_resolved(scenario.vehicle, spec.window.step_s)
     except ConfigError as fault:
-        faults += [Fault(f"{path}: {words}", words.code) for words in fault.faults]
+        faults += [Issue(f"{path}: {words}", words.code) for words in fault.faults]
     if faults:
         raise ConfigError(faults)
     return Study(spec, Plan(scenario, spec, spec.window, spec.outputs.scalars, spec.outputs.histories), path)
 
 
-def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
+def impossible_dispersions(dispersions: Dispersions) -> list[Issue]:
     """Return the keys of a dispersions file that whole trials cannot have."""
     air, found = dispersions.atmosphere, []
     for key in ("density", "wind_north_mps", "wind_east_mps"):
@@ -216,7 +216,7 @@ def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
         found.append("key 'atmosphere.day' = False: whole trials have a day each; leave it out")
     if dispersions.joint_is == "locked":
         found.append("key 'joint_is' = 'locked': whole trials fly the joint; leave it out")
-    return [Fault(words, "whole-mode-dispersion") for words in found]
+    return [Issue(words, "whole-mode-dispersion") for words in found]
 
 
 def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: Sequence[int]) -> list[Row]:

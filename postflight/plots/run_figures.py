@@ -86,9 +86,9 @@ def draw_deflections(flight: Reconstruction, folder: Path, answers: Deflections)
     if answers.fused is not None:
         answer = answers.fused
         words = f"{answer.agreement.remark}; {answer.limbs_remark}"
-        draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer.fused, answer.limbs, words)
+        draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer, answer.limbs, words)
         correlation = _stamped(figure_correlation, flight.flight)
-        draw(folder / "correlation.png", correlation, answer.fused, answer.agreement.singular_values)
+        draw(folder / "correlation.png", correlation, answer, answer.agreement.singular_values)
     if answers.histories:
         draw(folder / "summary.png", figure_summary, flight, answers)
 

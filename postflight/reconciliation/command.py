@@ -17,7 +17,7 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import GateError, Progress, check_type
+from flightmodel.checks import Check, GateError, Progress, check_type
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
@@ -51,7 +51,6 @@ from postflight.streams import keep_arrays, on_one_thread
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
-from recon.consistency import ConsistencyCheck, consistency_check
 from synthetic_flight.dispersions import Factor, JointDispersions
 
 STRONG = 3.0  # logarithm of odds of twenty to one
@@ -87,7 +86,7 @@ class Reconciliation(Tabular):
     fit: JointFit
 
     @cached_property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether the fit can be believed."""
         return credibility(self.fit, _modes(self.bet, self.fit)[0])
 
@@ -278,7 +277,7 @@ def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
 
 
 def _summary(
-    fit: JointFit, table: pd.DataFrame, odds: dict[str, float], checks: tuple[ConsistencyCheck, ...]
+    fit: JointFit, table: pd.DataFrame, odds: dict[str, float], checks: tuple[Check, ...]
 ) -> dict[str, object]:
     """Return the fit's quality and the joint, for ``reconciliation.json``."""
     return {
@@ -320,7 +319,7 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         )
 
 
-def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:
+def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Check, ...]:
     """Checks of residuals, moves, joins and convergence, and against the stiffness by the joint's frequency."""
     checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit), *_steps(fit), *_creep(fit))
     # a loose joint oscillates at the frequency of a softer one
@@ -329,7 +328,7 @@ def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Con
     return (*checks, _frequency(fit, modal))
 
 
-def _residuals(fit: JointFit) -> ConsistencyCheck:
+def _residuals(fit: JointFit) -> Check:
     """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
     problem = fit.problem
     # every parameter but the motion has an a priori residual; of the first motion all but the three rates
@@ -337,20 +336,20 @@ def _residuals(fit: JointFit) -> ConsistencyCheck:
     degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - problem.motion * problem.measured.spans
     degrees += first
     high = chi_square_quantile(CONFIDENCE, degrees) / degrees
-    return consistency_check(
+    return Check.of(
         "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,
         "residuals no larger than predicted", "residuals are larger than predicted", advice=JOINT_WORDS,
     )  # fmt: skip
 
 
-def _moves(fit: JointFit) -> ConsistencyCheck:
+def _moves(fit: JointFit) -> Check:
     """Largest move of what is stated of vehicle and instruments, over its a priori sd."""
     names = fit.problem.vehicle_parameters.names
     stated = np.array([name not in OPEN for name in names])
     moved = np.abs(np.concatenate([fit.parameters.vehicle * stated, fit.parameters.instruments]))
     worst = int(np.argmax(moved))
     name = names[worst] if worst < len(names) else _instrument(worst - len(names))
-    return consistency_check(
+    return Check.of(
         "joint-moves", "reconciliation: moves of what is stated", float(moved[worst]), 0.0, MOST_MOVED_SD,
         f"vehicle and instruments are as stated; largest: {name}, {moved[worst]:.1f} sd",
         f"{name} is {moved[worst]:.1f} sd from what is stated",
@@ -365,24 +364,24 @@ def _instrument(number: int) -> str:
     return "rates' errors" if number < 9 else "accelerometer's errors"
 
 
-def _spans(fit: JointFit) -> ConsistencyCheck:
+def _spans(fit: JointFit) -> Check:
     """Number of spans that do not match their measurements or their neighbours."""
     count = int(mismatched_spans(fit).sum())
     bad = f"{count} of {fit.problem.measured.spans} spans do not match sensors or neighbours"
-    return consistency_check(
+    return Check.of(
         "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
         advice="the motion between them is not the fitted joint's",
     )  # fmt: skip
 
 
-def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+def _steps(fit: JointFit) -> tuple[Check, ...]:
     """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded."""
     if fit.problem.held:
         return ()
     moved = np.abs(fit.moves_by_steps_sd)
     name = fit.problem.vehicle_parameters.names[int(np.argmax(moved))]
     return (
-        consistency_check(
+        Check.of(
             "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
             "finer integration steps move no estimate", f"finer integration steps move {name}",
             advice="the fit's own steps are too long for this motion: its intervals do not hold", component=name,
@@ -390,7 +389,7 @@ def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     )  # fmt: skip
 
 
-def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+def _creep(fit: JointFit) -> tuple[Check, ...]:
     """How many sd of creep the fit is short of, where it has none and the joint is resolved."""
     problem = fit.problem
     if problem.motion > MOTION or problem.held:
@@ -399,7 +398,7 @@ def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     share = worst.delayed / (1.0 + worst.delayed)
     words = f"{100.0 * share:.0f} % of the compliance with a time constant of {worst.time_s:g} s"
     return (
-        consistency_check(
+        Check.of(
             "joint-creep", "reconciliation: creep of the joint", max(worst.sds, 0.0), 0.0, MOST_OFF_SD,
             "deflections follow the moment without creep",
             f"deflections lag behind the moment, as of a joint that creeps (linear estimate: {words})",
@@ -408,21 +407,21 @@ def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     )  # fmt: skip
 
 
-def _frequency(fit: JointFit, modal: ModalStiffness) -> ConsistencyCheck:
+def _frequency(fit: JointFit, modal: ModalStiffness) -> Check:
     """Stiffness by the joint's frequency against the fit's: difference of the logarithms over its sd."""
     sd = np.hypot(modal.sd_nmprad / modal.stiffness_nmprad, posterior_sd(fit)[0][0])
     off = np.log(modal.stiffness_nmprad / fit.vehicle.joint.bending_stiffness_nmprad)
     words = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
-    return consistency_check(
+    return Check.of(
         "joint-frequency", "reconciliation: stiffness by the joint's frequency", float(abs(off) / sd), 0.0, MOST_OFF_SD,
         f"the joint oscillates as fitted ({words})", f"the joint oscillates as one of {words}",
         advice=JOINT_WORDS,
     )  # fmt: skip
 
 
-def _convergence(fit: JointFit) -> ConsistencyCheck:
+def _convergence(fit: JointFit) -> Check:
     """Whether the last step had nothing left to gain."""
-    return consistency_check(
+    return Check.of(
         "joint-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
         f"converged in {fit.steps} steps", f"not converged after {fit.steps} steps",
         advice="estimates and intervals are those of the last step",

@@ -14,7 +14,7 @@ import pandas as pd
 from rich.markup import escape
 from rich.table import Table
 
-from flightmodel.checks import ConfigError, Fault, GateError
+from flightmodel.checks import ConfigError, GateError, Issue
 from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
@@ -95,7 +95,7 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
     if any(Path(word).is_file() for word in words):
         _compare_with_file(words, output)
         return
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     found = []
     for word in words:
         try:

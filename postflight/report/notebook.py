@@ -31,7 +31,7 @@ run = folder / "runs" / {run!r}
 telemetry = read_flight(folder)
 summary = json.loads((run / "summary.json").read_text())
 print(telemetry.name, "(synthetic)" if telemetry.synthetic else "", telemetry.t0_utc)
-print(*telemetry.findings, sep="\\n")"""
+print(*(finding.line for finding in telemetry.findings), sep="\\n")"""
 _SENSORS = """\
 records = {"accelerometer": telemetry.accelerometer, "rates": telemetry.rates, **telemetry.radars, **telemetry.gnss,
            **telemetry.barometers}

@@ -32,7 +32,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import least_squares
 
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.tables import line_of, numbers, read_table, read_unit
 
 LABEL = "load test"
@@ -90,17 +90,17 @@ def read_load_test(
     GateError
         With every fault of the table.
     """
-    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[str]()
+    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[Issue]()
     t = _column(frame, time, ("time",), None, path, faults)
     moment = _column(frame, load, ("force", "moment"), arm_m, path, faults)
     angles = [_column(frame, name, ("length", "angle"), arm_m, path, faults) for name in displacements]
     if t is not None and not np.isfinite(t).all():
         row = int(np.argmin(np.isfinite(t)))
-        faults.append(Fault(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "time-missing"))
+        faults.append(Issue(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "time-missing"))
     elif t is not None and np.any(np.diff(t) <= 0.0):
         row = int(np.argmax(np.diff(t) <= 0.0)) + 1
         words = f"{LABEL}: {path}: line {line_of(frame, row)}: time {t[row]:g} s is not after {t[row - 1]:g} s"
-        faults.append(Fault(words, "time-order"))
+        faults.append(Issue(words, "time-order"))
     if faults:
         raise GateError(faults)
     assert t is not None
@@ -121,7 +121,7 @@ def read_load_test(
 
 
 def _column(
-    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[str]
+    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[Issue]
 ) -> FloatArray | None:
     """Column in SI; a force or a length with the arm as moment or angle."""
     name, _, unit = asked.partition(":")
@@ -129,14 +129,14 @@ def _column(
     if name not in frame.columns:
         columns = ", ".join(frame.columns)
         hint = nearest_name(name, list(frame.columns))
-        faults.append(Fault(f"{LABEL}: {path}: no column '{name}'{hint}; columns: {columns}", "column-missing"))
+        faults.append(Issue(f"{LABEL}: {path}: no column '{name}'{hint}; columns: {columns}", "column-missing"))
         return None
     read = read_unit(unit)
     kind, factor = _LOADS.get(unit.lower()) or ((read.kind, read.factor) if read else ("unknown", 1.0))
     if kind not in kinds:
         words = f"{LABEL}: {path}: column '{name}': unit '{unit}' is not one of {' or '.join(kinds)}; write"
         faults.append(
-            Fault(f"{words} {name}:UNIT (n, kn, lbf, nm, knm, lbfft; m, mm, deg, rad; s, min)", "unit-unknown")
+            Issue(f"{words} {name}:UNIT (n, kn, lbf, nm, knm, lbfft; m, mm, deg, rad; s, min)", "unit-unknown")
         )
         return None
     values = numbers(frame, name, path, LABEL, faults) * factor
@@ -144,7 +144,7 @@ def _column(
         return values
     if arm_m is None:
         words = f"{LABEL}: {path}: column '{name}' is a {kind}: state its lever arm about the joint with --arm-m"
-        faults.append(Fault(words, "arm-missing"))
+        faults.append(Issue(words, "arm-missing"))
         return None
     return values * arm_m if kind == "force" else values / arm_m
 

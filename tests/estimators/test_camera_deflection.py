@@ -19,7 +19,7 @@ from estimators.frame_solution import refused_fit
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
-from flightmodel.checks import Fault, GateError
+from flightmodel.checks import GateError, Issue
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, dot_positions
 from flightmodel.vehicle import CameraMount
@@ -323,7 +323,7 @@ def test_without_an_edge_in_the_benchmark_frame_no_edge_is_a_share_of_it(monkeyp
 
 def test_an_assumed_plane_without_edge_is_refused_by_its_reason(monkeypatch):
     """In it the edge alone counts: features can carry a film of which the rim is hidden, but not in a stated plane."""
-    none = Fault("too few points", "edge-points-too-few")
+    none = Issue("too few points", "edge-points-too-few")
     monkeypatch.setattr(OrientedCamera, "fit", lambda *_: refused_fit(no_horizon(none), none))
     monkeypatch.setattr(OrientedCamera, "edge_in_view", 0.25)
     frames, times = film(4, [0.0, 3.0], [0.0, 175.0]), np.array([421.0, 440.0])

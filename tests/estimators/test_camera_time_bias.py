@@ -15,12 +15,12 @@ from estimators.evidence import (
     evidence_of_history,
     moved_evidence,
 )
+from estimators.fusing import CameraTimeBias, fuse_flight, time_bias_if_free
 from estimators.fusion import fuse, smoothed, time_bias_is_observable
 from flightmodel import rotations
 from flightmodel.checks import DivergenceError
 from flightmodel.deflection import history_from_lateral
 from flightmodel.statistics import correlation
-from postflight.fusing import CameraTimeBias, fuse_flight, time_bias_if_free
 
 from .conftest import pulse_of
 
@@ -119,7 +119,7 @@ def test_a_time_bias_stated_as_zero_is_tested_but_not_applied():
     cov = np.tile(CAMERA_SD**2 * np.eye(2), (len(TIME_S), 1, 1))
     readings = history_from_lateral(TIME_S + late, truth, cov, "camera", "")
     trusted, allowed = fuse_flight(loads, readings), fuse_flight(loads, readings, camera_time_bias_sd_s=PRIOR_SD_S)
-    assert CAMERA_TIME_BIAS not in trusted.fused.inputs
+    assert CAMERA_TIME_BIAS not in trusted.inputs
     assert not trusted.camera_time_bias.applied
     assert trusted.camera_time_bias.is_off
     assert "+0.1" in trusted.camera_time_bias.remark

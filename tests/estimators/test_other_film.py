@@ -28,7 +28,7 @@ from estimators.frame_solution import FrameFit, NoFitError, refused_fit
 from estimators.virtual_camera import deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
-from flightmodel.checks import NO_FAULT, Fault
+from flightmodel.checks import NO_FAULT, Issue
 from flightmodel.film import burnt_in
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame, text_in_films
@@ -323,7 +323,7 @@ def test_a_picture_with_oblong_pixels_is_refused():
 def test_a_film_of_which_most_frames_show_no_shell_has_no_answer(code, refused, left):
     fits = answers(np.full(20, 2.0))
     for k in range(refused):
-        fits[k] = refused_fit(no_horizon(NO_FAULT), Fault("no shell", code))
+        fits[k] = refused_fit(no_horizon(NO_FAULT), Issue("no shell", code))
     found = without_remnants(fits)
     assert sum(not fit.refused for fit in found) == left
     if not left:

@@ -162,7 +162,7 @@ def test_gap_frozen_and_saturated_runs_are_findings(equipped):
         equipped.cell("magnetometer.csv", line, 2, "11.111")
     for line in range(20, 27):
         equipped.cell("magnetometer.csv", line, 1, "60.0")
-    by_code = {f.code: str(f) for f in read_flight(equipped.root).findings if f.source == "magnetometer"}
+    by_code = {f.code: f.line for f in read_flight(equipped.root).findings if f.source == "magnetometer"}
     assert set(by_code) == {"data-gap", "data-frozen", "data-saturated"}
     assert 0.75 in numbers_in(by_code["data-gap"])
     assert re.search(r"\bby\b.*\b21\b", by_code["data-frozen"])
