@@ -180,7 +180,7 @@ def study_damping(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack with 0.5 to 20 % damping at 2.5 Hz (Figure 3.1), into FOLDER."""
     from postflight.studies import commands
 
-    commands.damping(scenario, folder, seed)
+    commands.joint_study("damping", scenario, folder, seed)
 
 
 @study.command(name="stiffness")
@@ -190,7 +190,7 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack and normal acceleration from 2 to 4 Hz at 0.5 % (Figures 3.2, 3.3), into FOLDER."""
     from postflight.studies import commands
 
-    commands.stiffness(scenario, folder, seed)
+    commands.joint_study("stiffness", scenario, folder, seed)
 
 
 @study.command(name="shell-test")

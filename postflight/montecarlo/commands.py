@@ -87,14 +87,12 @@ def _origin(study: Study) -> str:
 
 def _print_merged(merged: Merged, folder: Path) -> None:
     """Percentiles with their intervals, and what failed."""
-    table = Table(title=f"{merged.summary['flights']} flights: percentiles")
-    for name in ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last"):
-        table.add_column(name, justify="left" if name == "output" else "right", no_wrap=name == "output")
-    for output, rows in merged.percentiles.groupby("output", sort=False):
-        last = rows.iloc[-1]
-        ends = (f"{'open' if np.isnan(x) else f'{x:.4g}'}" for x in (last["low_95"], last["high_95"]))
-        table.add_row(escape(str(output)), *(f"{value:.4g}" for value in rows["value"]), " to ".join(ends))
-    console.print(table)
+    rows = []
+    for output, band in merged.percentiles.groupby("output", sort=False):
+        ends = ("open" if np.isnan(x) else f"{x:.4g}" for x in band.iloc[-1][["low_95", "high_95"]])
+        rows.append((output, *(f"{value:.4g}" for value in band["value"]), " to ".join(ends)))
+    names = ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last")
+    console.table(f"{merged.summary['flights']} flights: percentiles", names, rows)
     for name, row in merged.summary.get("coverage", {}).items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()), highlight=False)
     if merged.summary["diverged"]:

@@ -73,10 +73,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
     air, pulse = flight.air, flight.required_loads()
-    for ax, bound, nominal in (
-        (upper, bounds.alpha_total_deg, bounds.nominal_alpha_deg),
-        (lower, bounds.normal_g, bounds.nominal_normal_g),
-    ):
+    for ax, (bound, nominal) in zip((upper, lower), bounds.by_quantity.values(), strict=True):
         share = f"2.3 to 97.7 % of {bounds.flights} rigid flights"
         ax.fill_between(bounds.time_s, bound[0], bound[2], color=COLOUR["prior_band"], lw=0, label=share)
         ax.plot(bounds.time_s, bound[1], color=COLOUR["prior"], lw=1, label="rigid, 50 %")

@@ -143,19 +143,17 @@ def figure_preflight(
     """
     figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    shown = (flight["time_s"] >= window[0]) & (flight["time_s"] <= window[1])
-    rows = (
-        ("alpha_total_deg", "nominal_alpha_deg", "total angle of attack (deg)"),
-        ("normal_g", "nominal_normal_g", "normal acceleration (g)"),
-    )
+    shown = flight["time_s"].between(*window)
+    rows = {"alpha_total_deg": "total angle of attack (deg)", "normal_g": "normal acceleration (g)"}
     for column, (bounds, name) in enumerate(((rigid, "joint locked"), (flexible, "flexible joint"))):
-        for ax, (quantity, nominal, _) in zip(axes[:, column], rows, strict=True):
-            percentiles(ax, bounds.time_s, *getattr(bounds, quantity))
-            ax.plot(bounds.time_s, getattr(bounds, nominal), color=COLOUR["nominal"], lw=1.0, ls="--", label="nominal")
+        for ax, quantity in zip(axes[:, column], rows, strict=True):
+            bands, nominal = bounds.by_quantity[quantity]
+            percentiles(ax, bounds.time_s, *bands)
+            ax.plot(bounds.time_s, nominal, color=COLOUR["nominal"], lw=1.0, ls="--", label="nominal")
             ax.plot(flight["time_s"], flight[quantity], color=COLOUR["measured"], label="flight, reconstructed")
         axes[0, column].set_title(f"{name}: {bounds.flights} flights")
         axes[1, column].set_xlabel(TIME)
-    for ax, (quantity, _, label) in zip(axes[:, 0], rows, strict=True):
+    for ax, (quantity, label) in zip(axes[:, 0], rows.items(), strict=True):
         ax.set(ylabel=label, ylim=(0.0, 2.2 * float(flight.loc[shown, quantity].max())))
     axes[0, 0].set_xlim(*window)
     axes[0, 0].legend()

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import GateError, Progress, check_type
 from flightmodel.deflection import DeflectionHistory
@@ -261,13 +260,12 @@ def _posterior_summary(posterior: Posterior | None) -> dict[str, object]:
 
 def _print_posterior(posterior: Posterior) -> None:
     """Table of the samples beside the linear problem."""
-    printed = Table(title="Posterior (emcee)")
-    for name in ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in posterior_summary(posterior).itertuples(index=False):
         interval = f"{r.low:.4g} to {r.high:.4g}"
-        printed.add_row(r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval)
-    console.print(printed)
+        rows.append((r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval))
+    names = ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval")
+    console.table("Posterior (emcee)", names, rows)
 
 
 def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
@@ -300,16 +298,14 @@ def _summary(
 
 def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> None:
     """Table of the joint, and the odds of the laws that were asked for."""
-    printed = Table(title="The joint that explains the flight")
-    for name in ("quantity", "vehicle file", "found", "1 sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in table.itertuples(index=False):
-        name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
+        found = f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}"
         if r.kind == "lower bound":
-            printed.add_row(name, f"{r.told:.4g}", f"above {r.low:.3g}", "", "95 % lower bound")
-            continue
-        printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
-    console.print(printed)
+            found = f"above {r.low:.3g}", "", "95 % lower bound"
+        rows.append((f"{r.quantity} ({r.unit})" if r.unit else r.quantity, f"{r.told:.4g}", *found))
+    names = ("quantity", "vehicle file", "found", "1 sd", "90 % interval")
+    console.table("The joint that explains the flight", names, rows)
     for law, name in LAW_NAMES.items():
         if law not in odds:
             continue

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import ConfigError, Fault, GateError
 from flightmodel.files import abandoned, partial_path, writing
@@ -166,9 +165,10 @@ def print_comparison(compared: RunComparison) -> None:
     t = compared.at_s
     when = f"at {t[0]:.2f} s, peak q of 1" if compared.same_clock else "each at its own peak q"
     rows, count = value_rows(compared), len(compared.runs)
-    _print_table(f"Runs side by side, {when}; ± is 1 sd", [str(k + 1) for k in range(count)], rows)
-    names = [name for k in range(2, count + 1) for name in (f"{k} less 1", "its sd")]
-    _print_table("Differences", names, [[row[0], *row[count + 1 :]] for row in rows])
+    names = ["quantity", *(str(k + 1) for k in range(count))]
+    console.table(f"Runs side by side, {when}; ± is 1 sd", names, [row[: count + 1] for row in rows])
+    names = ["quantity", *(name for k in range(2, count + 1) for name in (f"{k} less 1", "its sd"))]
+    console.table("Differences", names, [[row[0], *row[count + 1 :]] for row in rows])
     for k, relation in enumerate(compared.relations, 2):
         console.print(escape(f"{k} and 1: {relation.words}"), highlight=False)
     if any(relation.kind == CORRELATED for relation in compared.relations):
@@ -178,17 +178,6 @@ def print_comparison(compared: RunComparison) -> None:
         words = f"{label}: {int(passed.sum())} of {len(passed)} consistency checks pass"
         failed = [str(name) for name in run.checks["name"][~passed.astype(bool)]]
         console.print(escape(words + (f"; failed: {', '.join(failed)}" if failed else "")), highlight=False)
-
-
-def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
-    """Print a quantity a row, and as many of its cells as there are names."""
-    table = Table(title=title)
-    table.add_column("quantity", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*map(escape, row[: len(names) + 1]))
-    console.print(table)
 
 
 def value_rows(compared: RunComparison) -> list[list[str]]:

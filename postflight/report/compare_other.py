@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.config import parse_utc
@@ -69,18 +68,9 @@ def print_other(found: SystematicDifferences) -> None:
         console.print(escape(f"{found.label}: {note}"), highlight=False)
     names, rows = _effect_cells(found)
     if rows:
-        _print_table("Systematic differences, other minus run; ± is 1 sd", names, rows)
+        console.table("Systematic differences, other minus run; ± is 1 sd", names, rows)
     names, rows = _chi_square_cells(found)
-    _print_table("Chi-square per degree of freedom, mean over epochs", names, rows)
-
-
-def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
-    table = Table(title=title)
-    for k, name in enumerate(names):
-        table.add_column(name, justify="right" if k else "left", no_wrap=not k)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console.print(table)
+    console.table("Chi-square per degree of freedom, mean over epochs", names, rows)
 
 
 def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[str]]]:

@@ -17,7 +17,8 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.statistics import chi_square_quantile, inside
+from flightmodel.statistics import BAND_COLUMNS, chi_square_quantile, inside
+from flightmodel.tables import column_about
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
 from postflight.report.source import Rows, Run, kept_rows, rounded
@@ -204,7 +205,7 @@ def residual_panels(run: Run) -> list[Panel]:
 
 
 _FILE = "bands.csv"
-_LOW, _MIDDLE, _HIGH = "p2.3", "p50", "p97.7"
+_LOW, _MIDDLE, _HIGH = BAND_COLUMNS
 _COLOURS = (_GREY, COLOUR["second"], COLOUR["corrected"], _DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
 _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
@@ -232,10 +233,10 @@ def rigid_panels(run: Run) -> list[Panel]:
     if bounds is None:
         return []
     parts = []
-    for quantity, unit in (("alpha_total", "deg"), ("normal", "g")):
-        columns = {_LOW: "low", _MIDDLE: "median", _HIGH: "high", "nominal": "nominal"}
-        part = {new: bounds[f"{quantity}_{old}_{unit}"] for new, old in columns.items()}
-        parts.append(pd.DataFrame({"quantity": f"{quantity}_{unit}", "time_s": bounds["t_s"], **part}))
+    columns = {_LOW: "low", _MIDDLE: "median", _HIGH: "high", "nominal": "nominal"}
+    for quantity in ("alpha_total_deg", "normal_g"):
+        part = {new: bounds[column_about(quantity, old)] for new, old in columns.items()}
+        parts.append(pd.DataFrame({"quantity": quantity, "time_s": bounds["t_s"], **part}))
     return _band_panels(run, pd.concat(parts).assign(label="rigid"), "rigid")
 
 
