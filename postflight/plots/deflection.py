@@ -25,7 +25,7 @@ from postflight.plots.style import (
     band,
     in_style,
     legend_above,
-    stamp,
+    titled,
     with_holes,
 )
 from postflight.reconstruction import Reconstruction
@@ -75,9 +75,7 @@ def figure_summary(
     pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
     pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
-    figure.suptitle("Deflection of the aeroshell by each method")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "Deflection of the aeroshell by each method", flight.flight)
 
 
 def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -129,7 +127,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
     inputs.set_yticks(range(len(names)), names, fontsize=min(8.0, 160.0 / len(names)))
     inputs.set(xlabel="estimate and 1 sd, in a priori standard deviations (grey: a priori)")
-    figure.suptitle(fill(words, 130), fontsize=10)
+    figure.suptitle(fill(words, 130))
     return figure
 
 

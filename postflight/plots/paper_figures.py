@@ -26,7 +26,7 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
-from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, stamp
+from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, titled
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, entry_bounds
 
@@ -88,9 +88,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel=TIME)
     legend_above(upper, 3)
     legend_above(lower, 4)
-    figure.suptitle("Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)", flight.flight)
 
 
 @in_style
@@ -185,9 +183,7 @@ def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number
     ax.set(xlim=window(flight), ylabel="total angle of attack (deg)", xlabel=TIME)
     fit_height(ax, flight, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)
-    figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, f"{title} (AIAA 2011-2571, Figure {number})", flight.flight)
 
 
 @in_style

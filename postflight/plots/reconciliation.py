@@ -11,7 +11,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, titled
 from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
@@ -41,9 +41,7 @@ def figure_reconciled(
     _ridge(axes[2, 1], found)
     for ax in axes.ravel()[:5]:
         ax.set_xlabel(TIME)
-    figure.suptitle("Joint reconciled with the flight")
-    stamp(figure, telemetry)
-    return figure
+    return titled(figure, "Joint reconciled with the flight", telemetry)
 
 
 def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, label: str) -> None:
@@ -113,9 +111,7 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
                 ax.set_xlabel(table.columns[column], fontsize=8)
             if column == 0 and row > 0:
                 ax.set_ylabel(table.columns[row], fontsize=8)
-    figure.suptitle("Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)")
-    stamp(figure, telemetry)
-    return figure
+    return titled(figure, "Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)", telemetry)
 
 
 def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
@@ -148,6 +144,4 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     right.axvspan(low, high, color=_FOUND, alpha=BAND, lw=0, label="1 sd")
     right.set(xlabel="bending stiffness (N m/rad)", ylabel="power along the joint's track")
     right.legend()
-    figure.suptitle("Modes of the lateral motion and the linear model")
-    stamp(figure, telemetry)
-    return figure
+    return titled(figure, "Modes of the lateral motion and the linear model", telemetry)

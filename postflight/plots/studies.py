@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
-from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, note, percentiles
+from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, percentiles, titled
 from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
 from postflight.studies.shell_test import ShellTest
@@ -44,9 +44,7 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
         ax.margins(x=0)
     axes[0].legend()
     axes[-1].set_xlabel(TIME)
-    figure.suptitle(title, fontsize=10)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, title, synthetic)
 
 
 @in_style
@@ -70,9 +68,7 @@ def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
     ax.set_xlabel(f"share of the variance (bars) and 95 % interval (lines){more}")
     ax.grid(visible=False, axis="y")
     ax.legend(loc="lower right")
-    figure.suptitle(title, fontsize=10)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, title, synthetic)
 
 
 @in_style
@@ -96,9 +92,7 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter("")
     left.legend(fontsize=7)
-    figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)")
-    note(figure, synthetic)
-    return figure
+    return titled(figure, "Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)", synthetic)
 
 
 @in_style
@@ -121,9 +115,7 @@ def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synt
     ax.set(xlabel=f"{TIME}; dotted: peak dynamic pressure", ylabel=label, ylim=(0.0, min(highest, 1.15 * largest)))
     ax.set_xlim(study.flights[0].time_s[0], study.flights[0].time_s[-1])
     ax.legend(title=f"beyond the axis: {', '.join(beyond)}" if beyond else None)
-    figure.suptitle(title)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, title, synthetic)
 
 
 @in_style
@@ -157,9 +149,7 @@ def figure_preflight(
         ax.set(ylabel=label, ylim=(0.0, 2.2 * float(flight.loc[shown, quantity].max())))
     axes[0, 0].set_xlim(*window)
     axes[0, 0].legend()
-    figure.suptitle(f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", fontsize=10)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", synthetic)
 
 
 @in_style
@@ -182,5 +172,5 @@ def figure_shell_test(found: ShellTest, title: str) -> Figure:
     left.axhline(0.0, color=COLOUR["zero"], lw=0.8)
     left.set_xlabel("time (s)")
     left.set_ylabel("measured less fitted (% of the largest)")
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title)
     return figure

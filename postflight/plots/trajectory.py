@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, titled
 from postflight.reconstruction import AttitudeCheck, Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
@@ -40,9 +40,9 @@ def figure_flown(flight: Reconstruction) -> Figure:
     for ax in (high, fast, sure):
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
-    figure.suptitle("Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""))
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(
+        figure, "Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""), flight.flight
+    )
 
 
 @in_style
@@ -68,11 +68,11 @@ def figure_residuals(flight: Reconstruction) -> Figure:
         ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
         ax.set_ylim(-limit, limit)
     axes[-1].set_xlabel(TIME)
-    figure.suptitle(
-        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside", fontsize=10
+    return titled(
+        figure,
+        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside",
+        flight.flight,
     )
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
 
 
 def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) -> None:
@@ -117,9 +117,11 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     legend_above(grid[0, 0], 2)
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
-    figure.suptitle("Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(
+        figure,
+        "Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)",
+        flight.flight,
+    )
 
 
 @in_style
@@ -143,9 +145,7 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
     upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     _drag(lower.subplots(), day.drag)
-    figure.suptitle("As-flown atmosphere from the deceleration along the reconstructed trajectory")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "As-flown atmosphere from the deceleration along the reconstructed trajectory", flight.flight)
 
 
 def _along_height(
@@ -202,9 +202,9 @@ def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
     figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     axes[-1].set_xlabel(TIME)
     remark = "\n(not independent: the trajectory depends on these sensors too)" if check.dependence else ""
-    figure.suptitle("Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark)
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(
+        figure, "Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark, flight.flight
+    )
 
 
 @in_style
@@ -235,10 +235,9 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     grid[0].invert_yaxis()
     for ax in grid[len(groups) :]:
         ax.set_visible(False)
-    figure.suptitle(
+    return titled(
+        figure,
         "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
         "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
-        fontsize=10,
+        flight.flight,
     )
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure

@@ -61,7 +61,6 @@ LAW_NAMES = {
 }
 CONFIDENCE = 0.999  # as the reconstruction's checks
 MOST_OFF_SD = 4.0  # as the camera's time bias
-MOST_BY_STEPS_SD = 0.5  # which widens an interval by an eighth; the fit corrects what is above a tenth
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay) or creep (--creep), than was fitted; mass properties or sensors' places "
@@ -375,14 +374,17 @@ def _spans(fit: JointFit) -> ConsistencyCheck:
 
 
 def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
-    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded."""
+    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded.
+
+    Half a sd widens an interval by an eighth; the fit corrects what is above a tenth.
+    """
     if fit.problem.held:
         return ()
     moved = np.abs(fit.moves_by_steps_sd)
     name = fit.problem.vehicle_parameters.names[int(np.argmax(moved))]
     return (
         consistency_check(
-            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
+            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, 0.5,
             "finer integration steps move no estimate", f"finer integration steps move {name}",
             advice="the fit's own steps are too long for this motion: its intervals do not hold", component=name,
         ),
