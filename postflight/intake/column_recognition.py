@@ -26,6 +26,7 @@ from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import (
     AXES,
     BODY_RATES,
+    MARKS,
     NED,
     QUANTITIES,
     SEVERAL_MEANINGS,
@@ -54,13 +55,6 @@ _EARTH_RADII_M = (6.2e6, 7.5e6)
 _IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
 _OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
-_CLOCK_PARTS = (
-    {"h", "hour", "hours", "stunde", "hh"},
-    {"m", "min", "minute", "mm"},
-    {"s", "sec", "second", "sekunde", "ss"},
-)
-_SINCE_1970 = {"time", "t", "unix", "epoch", "timestamp", "zeit"}
-_NOT_FROM_T0 = {"tow", "sod", "utc", "gmt", "gps", "week"}  # seconds of these do not start at t0
 _UNIX_S = (1e9, 2.5e9)
 _FASTEST_S, _SLOWEST_S = 2e-5, 60.0
 _THREE_AXIS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
@@ -72,9 +66,6 @@ _ENDINGS = {"radars": "_radar", "gnss": "_gnss", "barometers": "_baro"}
 _MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 _AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
 _AIR_BY_COMPONENTS = ("wind_north", "wind_east")
-_OF_COMPONENTS = {"n", "e", "u", "v", "north", "east", "northward", "eastward"}
-_RECEIVER = {"gps", "gnss", "hae", "ellipsoid"}  # in the name of a height
-_OF_AIR = {"baro", "barometer", "barometric", "pressure", "press", "qnh"}
 _Family = tuple[tuple[str, ...], str]
 
 
@@ -181,7 +172,7 @@ def add_clock_columns(table: FreeFormTable) -> None:
             for number, short in enumerate(("h", "m", "s"), start=1):
                 _add(table, f"{name}_{short}", [m[number].replace(",", ".") if m else "" for m in parts])
             table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
-        elif first and set(re.findall(r"[a-z]+", name.lower())) & _SINCE_1970:
+        elif first and set(re.findall(r"[a-z]+", name.lower())) & MARKS["since_1970"]:
             values = table.numbers(k)
             scale = next(
                 (s for s in (1.0, 1e-3, 1e-6) if _UNIX_S[0] < np.nanmin(values, initial=np.inf) * s < _UNIX_S[1]), None
@@ -224,7 +215,7 @@ def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | N
     best = min(seconds, key=lambda k: (table.names[k] != "t_s", not named[k].units("time"), k))
     others = tuple(table.names[k] for k in seconds if k != best) + (parts or ())
     unit, how, why = _time_unit(named[best], table.numbers(best))
-    asked = bool(set(named[best].tokens) & _NOT_FROM_T0)
+    asked = bool(set(named[best].tokens) & MARKS["not_from_t0"])
     return TimeProposal((table.names[best],), "seconds", unit, how, why, asked, others)
 
 
@@ -241,8 +232,8 @@ def _hour_minute_second(table: FreeFormTable, named: list[ColumnName]) -> tuple[
     """Columns of hour, minute and second whose names differ in their last part alone."""
     parts = [re.findall("[a-z]+", n.name.lower()) for n in named]
     found = []
-    for spellings, top in zip(_CLOCK_PARTS, (24, 60, 61), strict=True):
-        last = [k for k, p in enumerate(parts) if p and p[-1] in spellings and (len(p) > 1 or len(named[k].name) > 1)]
+    for part, top in (("hour", 24), ("minute", 60), ("second", 61)):
+        last = [k for k, p in enumerate(parts) if p and p[-1] in MARKS[part] and (len(p) > 1 or len(named[k].name) > 1)]
         fitting = [
             k for k in last if np.nanmax(table.numbers(k), initial=-1.0) < top and np.nanmin(table.numbers(k)) >= 0
         ]
@@ -438,7 +429,7 @@ class Recogniser:
         tokens = {k: self.named[k].tokens for k in sorted(self.free)}
         found = [k for k, own in tokens.items() if matching(own, words) or "".join(own) in words]
         if short == "wind_speed":  # "wind from" is no speed, "wind north" none of the whole wind
-            found = [k for k in found if not set(tokens[k]) & (QUANTITIES["wind_from"] | _OF_COMPONENTS)]
+            found = [k for k in found if not set(tokens[k]) & (QUANTITIES["wind_from"] | MARKS["wind_component"])]
         return sorted(found, key=lambda k: (len(set(tokens[k]) - words), k))
 
     def _single(
@@ -557,14 +548,11 @@ class Recogniser:
     ) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
         """Claim a receiver's height: by its name, then the one that stands next to its latitude and longitude."""
         candidates = sorted(self.columns_of("alt"), key=lambda k: self._strangeness(k, beside))
-        ell = [k for k in candidates if set(self.named[k].tokens) & {"ell", "ellipsoid", "hae", "wgs", "wgs84"}]
-        msl = [k for k in candidates if set(self.named[k].tokens) & {"msl", "amsl", "geoid", "nn", "sea"}]
-        if ell:
-            self._set_aside(set(candidates) - {ell[0]})
-            return self._single(quantity, among=ell), [("height_is", '"ellipsoid"', "by the column's name")]
-        if msl:
-            self._set_aside(set(candidates) - {msl[0]})
-            return self._single(quantity, among=msl), [("height_is", '"msl"', "by the column's name")]
+        for mark, above in (("ellipsoid", '"ellipsoid"'), ("sea_level", '"msl"')):
+            stated = [k for k in candidates if set(self.named[k].tokens) & MARKS[mark]]
+            if stated:
+                self._set_aside(set(candidates) - {stated[0]})
+                return self._single(quantity, among=stated), [("height_is", above, "by the column's name")]
         found = self._single(quantity, among=candidates)
         if found is not None and len(candidates) > 1:
             others = ", ".join(f"'{self.table.names[k]}'" for k in candidates if self.table.names[k] != found.column)
@@ -576,7 +564,13 @@ class Recogniser:
         own = {t for t in self.named[k].tokens if t.isalpha()} - QUANTITIES["alt"]
         theirs = {t for at in beside for t in self.named[at].tokens} - QUANTITIES["lat"] - QUANTITIES["lon"]
         away = min((abs(k - at) for at in beside), default=0)
-        return not own & _RECEIVER, bool(own & _OF_AIR), len(own ^ theirs), away, k < min(beside, default=0)
+        return (
+            not own & MARKS["receiver"],
+            bool(own & MARKS["air"]),
+            len(own ^ theirs),
+            away,
+            k < min(beside, default=0),
+        )
 
     def _set_aside(self, at: set[int]) -> None:
         self.spare |= at & self.free

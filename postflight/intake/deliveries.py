@@ -56,7 +56,7 @@ from postflight.intake.column_recognition import (
 )
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.freeform_tables import FreeFormTable
-from postflight.intake.headers import fold, parse_column_name
+from postflight.intake.headers import MARKS, fold, parse_column_name
 from postflight.intake.stored_tables import read_tables
 from postflight.terminal import terminal
 
@@ -67,11 +67,9 @@ _TABLES = (  # what is named so and holds no table is refused
 )  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _FILMS = (".webm", ".mp4", ".avi")
-_FRAME_TOKENS = {"frame", "frames", "frameno", "picture", "image", "bild"}
 _BELONG = 0.9  # of a list's names, in the folder that it is of
 _RADIOSONDE = {"alt", "temperature", "pressure"}
 _BY_DIRECTION, _BY_COMPONENTS = {"wind_speed", "wind_from"}, {"wind_north", "wind_east"}
-_GEOMETRIC = {"gps", "gnss", "geometric", "ell", "ellipsoid", "hae"}  # in the name of a height
 _ZERO_C_K = 273.15
 _LOWEST_M, _HIGHEST_M = -1000.0, 2e5
 EXIT_NOT_ALL_USED = 3
@@ -170,7 +168,7 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     if "rho" in found or _missing_of_a_radiosonde(found):
         return None
     height_name = column_names(table)[table.names.index(found["alt"].column)]
-    is_geometric = bool(_GEOMETRIC & set(height_name.tokens))
+    is_geometric = bool(MARKS["geometric"] & set(height_name.tokens))
     c = {short: to_si(table.numbers(table.names.index(m.column)), m.unit) for short, m in found.items()}
     dew = _dew_point(recogniser)
     height, p = c["alt"], c["pressure"]
@@ -368,7 +366,7 @@ def _is_picture(cell: str) -> bool:
 
 def _is_frame_number(table: FreeFormTable, k: int) -> bool:
     values = table.numbers(k)
-    named = set(parse_column_name(table.names[k]).tokens) & _FRAME_TOKENS
+    named = set(parse_column_name(table.names[k]).tokens) & MARKS["frame"]
     return bool(named) and bool((np.isfinite(values) & (values >= 0.0) & (values == np.round(values))).all())
 
 

@@ -135,7 +135,7 @@ def _guarded(
     except GateError:
         raise
     except ImportError as fault:
-        raise _missing(path, fault, missing) from None
+        raise ConfigError(f"{path}: {missing_library(fault)}, or store it as CSV", code=missing) from None
     except Exception as fault:  # each library has its own
         words = f"cannot be read ({type(fault).__name__}: {fault}); store it again, or as CSV"
         raise GateError(f"{path}: {words}", code=unreadable) from None
@@ -145,12 +145,12 @@ def _guarded(
     return tables
 
 
-def _missing(path: Path, fault: ImportError, code: str) -> ConfigError:
+def missing_library(fault: ImportError) -> str:
+    """What installs the optional library that could not be imported, in words; any other fault is raised again."""
     name = (fault.name or "").partition(".")[0]
     if name not in EXTRAS:
         raise fault
-    words = f"needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]', or store it as CSV"
-    return ConfigError(f"{path}: {words}", code=code)
+    return f"needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
 
 
 def _check_readable(path: Path, kind: str) -> None:
