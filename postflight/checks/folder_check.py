@@ -183,7 +183,8 @@ def _vehicle_faults(folder: Path) -> list[Fault]:
 
 
 def _refuse(report: Report, folder: Path, faults: Sequence[str], code: int) -> None:
-    report.fill_in = placeholders(folder)
+    still_open = placeholders(folder)
+    report.fill_in = [f"{path}: key '{key}' {FILL_IN}" for path, keys in still_open.items() for key in keys]
     report.refused = [Fault(words) for words in faults if FILL_IN not in words]
     report.exit_code = code
 

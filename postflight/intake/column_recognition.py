@@ -48,15 +48,9 @@ _BANDS: dict[str, list[tuple[float, float, str]]] = {
     "temperature": [(150.0, 400.0, "k"), (-120.0, 60.0, "degc")],
     "density": [(0.5, 1.5, "kgpm3"), (500.0, 1500.0, "gpm3")],
 }
-_FASTEST_RADPS = 400.0
-_G_OR_GAUSS = {"acceleration", "magnetic field"}
-_FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
-_EARTH_RADII_M = (6.2e6, 7.5e6)
 _IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
 _OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
-_UNIX_S = (1e9, 2.5e9)
-_FASTEST_S, _SLOWEST_S = 2e-5, 60.0
 _THREE_AXIS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "acceleration": ("sensors.accelerometer", tables.ACCELEROMETER),
     "rate": ("sensors.rates", tables.RATES),
@@ -111,10 +105,8 @@ class SourceProposal:
 # units by numbers
 
 
-def _vector_unit(kind: str, values: FloatArray) -> tuple[str, str]:
-    """Return the unit of three axes (n, 3) of a kind, and why; an empty unit with what was seen where that is open."""
-    size = np.linalg.norm(values, axis=1)
-    size = size[np.isfinite(size)]
+def _vector_unit(kind: str, size: FloatArray) -> tuple[str, str]:
+    """Return the unit of vectors of sizes (n,) of a kind, and why; an empty unit with what was seen if that is open."""
     if not len(size):
         return "", "no numbers"
     if kind == "acceleration":
@@ -128,7 +120,7 @@ def _vector_unit(kind: str, values: FloatArray) -> tuple[str, str]:
     if kind == "magnetic field":
         middle = float(np.median(size))
         return _band(kind, middle), f"magnitude {middle:.3g} (median)"
-    if kind == "rate" and size.max() > _FASTEST_RADPS:
+    if kind == "rate" and size.max() > 400.0:
         return "degps", f"up to {size.max():.4g}: no body rotates at so many rad/s"
     return "", f"magnitude up to {float(size.max()):.3g}"
 
@@ -174,9 +166,8 @@ def add_clock_columns(table: FreeFormTable) -> None:
             table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
         elif first and set(re.findall(r"[a-z]+", name.lower())) & MARKS["since_1970"]:
             values = table.numbers(k)
-            scale = next(
-                (s for s in (1.0, 1e-3, 1e-6) if _UNIX_S[0] < np.nanmin(values, initial=np.inf) * s < _UNIX_S[1]), None
-            )
+            first_s = np.nanmin(values, initial=np.inf)
+            scale = next((s for s in (1.0, 1e-3, 1e-6) if 1e9 < first_s * s < 2.5e9), None)
             if scale is not None:
                 stamps = (values * scale * 1e6).round()
                 iso = [f"{np.datetime64(int(s), 'us')}Z" if np.isfinite(s) else "" for s in stamps]
@@ -268,7 +259,7 @@ def _time_unit(named: ColumnName, values: FloatArray) -> tuple[str, str, str]:
     usual = float(np.median(step[step > 0.0]))
     whole = bool((known == np.round(known)).all())
     seen = f"steps of {usual:.4g}"
-    if not whole and usual < _SLOWEST_S and usual * 1e-3 < _FASTEST_S * 10:
+    if not whole and usual < 60.0 and usual * 1e-3 < 2e-4:
         return "s", NUMBERS, f"{seen}: as ms they would be {1e3 / usual:.3g} Hz"
     return "", ASKED, seen
 
@@ -362,7 +353,7 @@ class Recogniser:
             if kind in ("rate", "magnetic field", "acceleration") or kind in worded:
                 return kind, "unit"
             return "", ""
-        if stated == _G_OR_GAUSS and not worded and self._is_g(at):
+        if stated == {"acceleration", "magnetic field"} and not worded and self._is_g(at):
             return "acceleration", "three axes"
         if stated and len(fitting) != 1:
             return "", ""
@@ -377,17 +368,21 @@ class Recogniser:
         families = self._families()
         if any(family == "body" or matching(stem, VECTORS["rate"]) for stem, family in families):
             return False
-        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
-        size = size[np.isfinite(size)]
+        size = self._sizes(at)
         return len(size) > 0 and float(size.std()) > _STEADY * float(size.mean())
+
+    def _sizes(self, at: list[int]) -> FloatArray:
+        """Sizes (n,) of the vectors of three columns where all are known."""
+        size: FloatArray = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
+        return size[np.isfinite(size)]
 
     def _is_g(self, at: list[int]) -> bool:
         """Whether ``g`` is no gauss: a small letter, or of a magnitude that the Earth's field has nowhere."""
         if all(unit_key(self.named[k].unit_text) == self.named[k].unit_text for k in at):
             return True
-        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
-        size = size[np.isfinite(size)]
-        return len(size) > 0 and not _FIELD_GAUSS[0] < float(np.median(size)) < _FIELD_GAUSS[1]
+        size = self._sizes(at)
+        # the Earth's field, with some iron, and less than 1 g
+        return len(size) > 0 and not 0.15 < float(np.median(size)) < 0.9
 
     def may_be_inertial(self) -> bool:
         """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
@@ -407,7 +402,7 @@ class Recogniser:
     def _vector_columns(
         self, kind: str, quantities: Iterable[Quantity], at: list[int], why: str
     ) -> list[ColumnProposal]:
-        by_numbers, seen = _vector_unit(kind, np.column_stack([self.table.numbers(k) for k in at]))
+        by_numbers, seen = _vector_unit(kind, self._sizes(at))
         out = []
         for q, k in zip(quantities, at, strict=True):
             unit = next(iter(self.named[k].units(kind)), "")
@@ -478,15 +473,15 @@ class Recogniser:
                 names = ", ".join(f"'{self.table.names[k]}'" for k in first)
                 self.table.notes.append(f"{names}: whole degrees beside fixes are taken as computed from these")
                 return []
-        found = [self._single(q) for q in tables.RADAR]
-        if any(m is None for m in found):
+        found = [m for q in tables.RADAR if (m := self._single(q))]
+        if len(found) < len(tables.RADAR):
             return []
         keys = [(key, FILL_IN_TOML, words) for key, words in (
             ("latitude_deg", "deg: the radar's site, WGS-84"), ("longitude_deg", "deg, east positive"),
             ("height_m", "m above the ellipsoid"),
         )]  # fmt: skip
         found += self._own_noise(tables.TRACKER_SD)
-        return [SourceProposal(f"radars.{self.name}", [m for m in found if m], keys)]
+        return [SourceProposal(f"radars.{self.name}", found, keys)]
 
     def _receiver(self) -> list[SourceProposal]:
         """Positions by latitude and longitude or ECEF, velocities."""
@@ -501,11 +496,7 @@ class Recogniser:
             height, key = self._height(quantity["alt"], beside)
             found += [height] if height else []
             keys += key
-        for shorts in (("vx", "vy", "vz"), ("vn", "ve", "vd")):
-            velocity = self._vectors("speed", shorts)
-            if velocity:
-                found += velocity
-                break
+        found += self._vectors("speed", ("vx", "vy", "vz")) or self._vectors("speed", ("vn", "ve", "vd"))
         satellites = self.columns_of("nsat")
         if satellites:
             self.free.discard(satellites[0])
@@ -541,7 +532,7 @@ class Recogniser:
         unit = next(iter(self.named[at[0]].units("length")), "m")
         axes = [tables.to_si(self.table.numbers(k).copy(), unit) for k in at]
         size: FloatArray = np.linalg.norm(np.column_stack(axes), axis=1)
-        return bool(_EARTH_RADII_M[0] < np.nanmedian(size) < _EARTH_RADII_M[1])
+        return bool(6.2e6 < np.nanmedian(size) < 7.5e6)
 
     def _height(
         self, quantity: Quantity, beside: list[int]
@@ -579,9 +570,7 @@ class Recogniser:
     def _barometer(self) -> list[SourceProposal]:
         """Static pressure, or heights."""
         height, pressure = tables.BAROMETER
-        found = self._single(pressure)
-        if found is None:
-            found = self._single(height, "alt")
+        found = self._single(pressure) or self._single(height, "alt")
         if found is None:
             return []
         what = '"ellipsoid" or "msl"; pressures too'

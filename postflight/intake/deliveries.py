@@ -61,17 +61,13 @@ from postflight.intake.stored_tables import read_tables
 from postflight.terminal import terminal
 
 _WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
-_DAVEML = (".dml",)
 _TABLES = (  # what is named so and holds no table is refused
     ".csv", ".tsv", ".dat", ".asc", ".tab", ".mat", ".xlsx", ".xlsm", ".xls", ".parquet", ".nc", ".cdf", ".h5", ".hdf5",
 )  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _FILMS = (".webm", ".mp4", ".avi")
-_BELONG = 0.9  # of a list's names, in the folder that it is of
 _RADIOSONDE = {"alt", "temperature", "pressure"}
 _BY_DIRECTION, _BY_COMPONENTS = {"wind_speed", "wind_from"}, {"wind_north", "wind_east"}
-_ZERO_C_K = 273.15
-_LOWEST_M, _HIGHEST_M = -1000.0, 2e5
 EXIT_NOT_ALL_USED = 3
 console = terminal()
 
@@ -108,18 +104,7 @@ def sidecar_text(columns: dict[str, str]) -> str:
     axes = "wind" if "cd" in columns else "body"
     value = "0.0".ljust(9) if nose else FILL_IN_TOML
     why = f"; by '{columns['cm']}'" if nose else ""
-    return (
-        "# What the numbers of the coefficient table of this name refer to. Values FILL IN are needed.\n"
-        f"source = {FILL_IN_TOML}                      # where they come from\n"
-        f"licence = {FILL_IN_TOML}                     # on what terms\n"
-        f"area_m2 = {FILL_IN_TOML}                     # m2: reference area of the coefficients\n"
-        f"length_m = {FILL_IN_TOML}                    # m: reference length of the moments\n"
-        f"moment_reference_station_m = {value}   # m aft of the nose: the point that C_m is about{why}\n"
-        f'axes = "{axes}"                           # "body": C_A and C_N; "wind": C_D and C_L\n'
-        'damping_per = "ql/2V"                   # or "ql/V"\n'
-        "# [uncertainty]                         # one standard deviation, as fractions\n"
-        "# ca = 0.03\n# cn = 0.07\n# cm = 0.1\n"
-    )
+    return template("coefficients").format(moment_station=value, why=why, axes=axes)
 
 
 def _named_in_form(text: str, beside: str) -> str | None:
@@ -173,7 +158,7 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     dew = _dew_point(recogniser)
     height, p = c["alt"], c["pressure"]
     with np.errstate(invalid="ignore"):
-        whole = (height > _LOWEST_M) & (height < _HIGHEST_M) & (p > 0.0)
+        whole = (height > -1000.0) & (height < 2e5) & (p > 0.0)
     height = np.where(whole, height, np.nan)
     up = -np.log(np.where(whole, p, 1.0))
     temperature, filled_t = _between(up, c["temperature"], whole)
@@ -218,7 +203,7 @@ def _missing_of_a_radiosonde(found: dict[str, ColumnProposal]) -> str:
 
 def _moist_density(pressure_pa: FloatArray, temperature_k: FloatArray, dew_point_k: FloatArray) -> FloatArray:
     """Density (n,), kg/m^3, by the gas law with the virtual temperature; dry where the dew point is NaN."""
-    celsius = np.nan_to_num(dew_point_k - _ZERO_C_K, nan=-200.0)
+    celsius = np.nan_to_num(dew_point_k - 273.15, nan=-200.0)
     vapour = np.where(celsius > -150.0, 611.2 * np.exp(17.67 * celsius / np.maximum(celsius + 243.5, 1.0)), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         dry_part = 1.0 - 0.378 * vapour / pressure_pa
@@ -278,18 +263,18 @@ def _video_of(path: Path, telemetry: Path) -> Video | None:
 def _copy(video: Video) -> None:
     """Copy pictures or film beside their place and rename, so that they are whole or not there."""
     video.place.parent.mkdir(parents=True, exist_ok=True)
-    partial = video.place.with_name(f".partial-{video.place.name}")
     with writing(video.place, "choose a folder that you may write to"):
+        if video.is_film:
+            write_file(video.place, lambda partial: shutil.copyfile(video.source, partial))
+            return
+        partial = video.place.with_name(f".partial-{video.place.name}")
         try:
-            if video.is_film:
-                shutil.copyfile(video.source, partial)
-            else:
-                partial.mkdir()
-                for name in video.names:
-                    shutil.copyfile(video.source / name, partial / name)
+            partial.mkdir()
+            for name in video.names:
+                shutil.copyfile(video.source / name, partial / name)
             partial.replace(video.place)
         finally:
-            partial.unlink(missing_ok=True) if video.is_film else shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def frame_list(
@@ -322,7 +307,7 @@ def frame_list(
     _rename(table, at, bare=pictures is not None)
     names = set(table.cells(at))
     films = [v for v in videos if v.is_film]
-    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= _BELONG * len(names)]
+    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= 0.9 * len(names)]
     key, fitting = ("folder", folders) if pictures is not None else ("film", films)
     there = f'"{fitting[0].place.relative_to(folder).as_posix()}"' if len(fitting) == 1 else FILL_IN_TOML
     where = "where the pictures lie" if key == "folder" else "the first frame's number in it is 0"
@@ -466,13 +451,9 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
 def _print_placeholders(folder: Path) -> None:
     """Print which values are still to fill in, file by file."""
     still_open = placeholders(folder)
-    by_file: dict[str, list[str]] = {}
-    for words in still_open:
-        file, key = words.split(": key '", 1)
-        by_file.setdefault(file, []).append(key.rsplit("'", 1)[0])
-    for file, keys in by_file.items():
-        console.print(f"[cyan]to fill in[/] {escape(file)}: {escape(', '.join(keys))}", highlight=False)
-    following = f"{len(still_open)} values to fill in. Next: postflight check {folder}"
+    for file, keys in still_open.items():
+        console.print(f"[cyan]to fill in[/] {escape(str(file))}: {escape(', '.join(keys))}", highlight=False)
+    following = f"{sum(map(len, still_open.values()))} values to fill in. Next: postflight check {folder}"
     console.print(escape(following), highlight=False)
 
 
@@ -491,7 +472,7 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
         elif file.is_dir():
             words = f"{file}: a folder without pictures; name the files in it: {file / '*'}"
             came.skipped.append(Fault(words, "nothing-to-import"))
-        elif file.suffix.lower() in _DAVEML:
+        elif file.suffix.lower() == ".dml":
             came.daveml[file] = _bytes_of(file)
         elif file.suffix.lower() in _PICTURES:
             words = f"{file}: a picture alone; name the folder that holds a video's pictures"

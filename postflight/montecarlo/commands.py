@@ -23,11 +23,12 @@ from synthetic_flight.ensemble import available_cores, check_outputs
 
 
 def run(
-    name: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None, until: str | None
-) -> None:
+    dispersions: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None,
+    until_width: str | None,
+) -> None:  # fmt: skip
     """Fly what is missing and merge."""
-    study = read_study(name)
-    stop = study.spec.stop if until is None else stop_from(until, study)
+    study = read_study(dispersions)
+    stop = study.spec.stop if until_width is None else stop_from(until_width, study)
     wanted = Wanted(flights or study.spec.flights, workers or available_cores(), scheduler, stop)
     count = fly(study, folder, wanted)
     finish(study, folder, count)

@@ -30,8 +30,6 @@ from postflight.plots.style import (
 )
 from postflight.reconstruction import Reconstruction
 
-_MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
-
 
 @in_style
 def figure_summary(
@@ -88,7 +86,7 @@ def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray
         ax.plot(frames.time_s, np.rad2deg(frames.theta_rad), ".", color=COLOUR["camera"], ms=3, label="_frames")
     for method, history in answers.continuous.items():
         t, (theta, sd) = with_holes(history.time_s, [np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)])
-        mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
+        mark = "" if len(history.time_s) > 400 else "."  # of many answers none is marked
         style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
         ax.plot(t, theta, label=LABEL[method], **style)
         band(ax, t, theta, sd, COLOUR[method], alpha=WIDE_BAND)
@@ -196,7 +194,6 @@ _PANELS = (
     ("C_m: increment (%)", 100.0),
     ("C_mq: increment", 1.0),
 )
-_SHOWN_SD = 2.5  # a priori ones that a panel shows at least
 
 
 @in_style
@@ -227,5 +224,6 @@ def _along_mach(ax: Axes, increments: AeroIncrements, k: int, scale: float) -> N
     band(ax, mach, shown, sd, COLOUR["estimate"], label="1 sd")
     if not seen.any():
         ax.text(0.5, 0.9, "not determined by this flight", ha="center", transform=ax.transAxes)
-    top = max(_SHOWN_SD * prior_sd, 1.1 * float(np.max(np.abs(mean) + sd)))
+    # a panel shows 2.5 a priori sd at least
+    top = max(2.5 * prior_sd, 1.1 * float(np.max(np.abs(mean) + sd)))
     ax.set_ylim(-top, top)

@@ -30,7 +30,6 @@ from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_ab
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, entry_bounds
 
-_STIFF_SHOWN = 20.0  # a joint so many times as stiff as wanted is shown; a locked one lies beyond the axis
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
@@ -192,7 +191,8 @@ def figure_2_9(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: flo
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
     marks = (static.critical_stiffness_nmprad, joint_nmprad, static.stiffness_for_growth(0.25))
-    ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, _STIFF_SHOWN * marks[2]))
+    # a joint 20 times as stiff as wanted is shown; a locked one lies beyond the axis
+    ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, 20.0 * marks[2]))
     stiffness = np.geomspace(*ends, 600)
     for offset, colour in zip(offsets_m, MANY[1:], strict=False):
         angle = np.rad2deg(static.trim_angle(stiffness, offset))

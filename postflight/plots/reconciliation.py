@@ -17,7 +17,6 @@ from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
 
 _FOUND = COLOUR["estimate"]
-_HIGHEST_HZ = 5.0
 
 
 @in_style
@@ -127,7 +126,7 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     figure = Figure(figsize=(9.0, 4.8))
     left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
     left.grid(visible=False)
-    shown = np.abs(found.frequency_hz) < _HIGHEST_HZ
+    shown = np.abs(found.frequency_hz) < 5.0
     picture = left.pcolormesh(
         found.time_s, found.frequency_hz[shown], found.power.T[shown], shading="nearest", cmap="Greys", vmin=0.0
     )

@@ -16,8 +16,6 @@ from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 from recon.measurements import component_unit
 
-_LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
-
 
 @in_style
 def figure_flown(flight: Reconstruction) -> Figure:
@@ -97,8 +95,8 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     t, off = smoothed.time_s, difference(filtered, smoothed)
     var_filter, var_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (filtered.covariance, smoothed.covariance))
     lost = var_filter - var_smoother
-    # towards the end both are the same, and the ratio of nothing to nothing
-    sure = lost > _LEAST_LOST * var_filter
+    # towards the end both are the same, and the ratio of nothing to nothing: a thousandth of the variance must be lost
+    sure = lost > 1e-3 * var_filter
     ratio = np.where(sure, off / np.sqrt(np.where(sure, lost, 1.0)), np.nan)
     for k, ((name, unit, scale), (spread, apart)) in enumerate(zip(groups, grid, strict=True)):
         part = slice(3 * k, 3 * k + 3)

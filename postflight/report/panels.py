@@ -25,12 +25,12 @@ from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
 from recon.measurements import component_unit
 
-_TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
-_BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
-_DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
+_TRAJECTORY_ROWS, _RAW_POINTS = 6000, 8000
 _NO_ACCELEROMETER = "The flight has no accelerometer."
 _NO_GYROS = "Its accelerometer serves as a deceleration along the path; without gyros no force has known axes."
 _NO_ATTITUDE = "No inertial sensors carried the attitude, so the angle of attack is not known."
+_BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
+_DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
 NO_DEFLECTION = "No method gave a deflection; the reasons stand on the cards above."
 
 Panel = dict[str, Any]
@@ -121,7 +121,7 @@ def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     tracks += [(name, r.time_s, r.position_ecef_m) for name, r in run.telemetry.gnss.items() if r.has_positions]
     known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
-    return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
+    return [_points(name, t, h / 1e3, _GREY, 4, 6000 // len(known)) for name, t, h in known]
 
 
 def _raw_accelerations(run: Run) -> dict[str, list[dict[str, Any]]]:
@@ -193,7 +193,7 @@ def residual_panels(run: Run) -> list[Panel]:
         scale, unit = drawn_unit(str(rows["unit"].iloc[0]) if "unit" in rows else component_unit(component))
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
-        kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))
+        kept = kept_rows([r, np.where(good, np.nan, r)], 16000 // len(pairs))
         gate = float(np.sqrt(chi_square_quantile(chance, int(rows["together"].max()))))
         out.append(
             {"id": f"residual_{len(out)}", "title": f"{source}: {component}", "unit": unit, "gate": round(gate, 3),
@@ -206,6 +206,7 @@ def residual_panels(run: Run) -> list[Panel]:
 
 _FILE = "bands.csv"
 _LOW, _MIDDLE, _HIGH = BAND_COLUMNS
+_G = earth.STANDARD_GRAVITY_MPS2
 _COLOURS = (_GREY, COLOUR["second"], COLOUR["corrected"], _DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
 _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
@@ -213,13 +214,9 @@ _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "normal_g": (
         "Normal acceleration at the c.g.",
         "g",
-        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
+        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / _G,
     ),
-    "axial_g": (
-        "Axial deceleration at the c.g.",
-        "g",
-        lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2,
-    ),
+    "axial_g": ("Axial deceleration at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / _G),
     "rate_degps": ("Lateral rate", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),
@@ -328,12 +325,8 @@ def _band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> li
     t = rounded(band["time_s"].to_numpy(), 3)
     low, middle, high = (rounded(band[c].to_numpy(), 4) for c in (_LOW, _MIDDLE, _HIGH))
     words = f"{label}, median; {100 * share:.0f} % of the pulse inside"
-    lines = [
-        {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
-    ]
-    if band["nominal"].notna().any():
-        nominal = rounded(band["nominal"].to_numpy(), 4)
-        lines.append(
-            {"label": f"{label}, nominal", "t": t, "y": nominal, "colour": _DARK, "dash": [2, 3], "width": 1.2}
-        )
-    return lines
+    one = {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
+    if not band["nominal"].notna().any():
+        return [one]
+    y = rounded(band["nominal"].to_numpy(), 4)
+    return [one, {"label": f"{label}, nominal", "t": t, "y": y, "colour": _DARK, "dash": [2, 3], "width": 1.2}]

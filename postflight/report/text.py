@@ -33,7 +33,7 @@ _BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "tri
 _ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
-_NEAR_PEAK_S, _OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
+_NEAR_PEAK_S = 1.0  # window about the peak
 
 
 def date(utc: str) -> str:
@@ -132,7 +132,8 @@ def _oscillation(run: Run) -> str:
             f"about it, {first:.2f} to {last:.2f} s, the largest at {answer['largest_at_s']:.2f} s."
         )
     near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
-    if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
+    # a range that one number describes
+    if len(near) < 2 or near.max() - near.min() < 4.0 * answer["sd_deg"]:
         return ""
     return (
         f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "

@@ -17,7 +17,7 @@ from flightmodel.vehicle import Vehicle
 from postflight.report.source import Rows, Run, rounded
 from postflight.run_folder import answer_table
 
-_LEAST_SECTIONS, _POINTS_PER_TORUS, _CONE_PIECES, _POSES = 48, 7, 8, 3000
+_CONE_PIECES, _POSES = 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
@@ -26,9 +26,9 @@ def solid(vehicle: Vehicle) -> dict[str, Any]:
     Seen from outside, a quadrangle's vertices go round against the clock.
     """
     geometry = vehicle.geometry
-    per_gore = max(1, -(-_LEAST_SECTIONS // geometry.gore_count))
+    per_gore = max(1, -(-48 // geometry.gore_count))  # 48 sections or more in all
     sections = per_gore * geometry.gore_count
-    aft = aft_profile(geometry, _POINTS_PER_TORUS)
+    aft = aft_profile(geometry, 7)
     forward = forward_profile(geometry)
     forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], _CONE_PIECES + 1)[1:]])
     # the centerbody shows where it comes out of the shell; it ends in a lid

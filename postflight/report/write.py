@@ -44,8 +44,6 @@ STYLES = ("uPlot.min.css", "page.css")
 SHARED = ("head.html", "parts.html", "foot.html")  # what the pages share: how they begin and end, and macros
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
 _ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
-_LEAST_POINTS = 30  # of residuals: the noise to an eighth
-_DEG = "deg"
 # kind of tracker in flight.toml: its keys, each from which components, and the stated size in that key's unit
 _Stated = Callable[[dict[str, Any]], float | None]
 _KEYS: dict[str, tuple[tuple[str, tuple[str, ...], _Stated], ...]] = {
@@ -265,7 +263,8 @@ def _noise(run: Run, group: str, name: str) -> list[str]:
     stated = next((s for s in run.header["sensors"] if s.get("name") == name), None)
     if residuals is None or stated is None:
         return []
-    mine = residuals[(residuals["source"] == name) & (residuals["count"] - residuals["edited"] >= _LEAST_POINTS)]
+    # the noise is found to an eighth from so many residuals
+    mine = residuals[(residuals["source"] == name) & (residuals["count"] - residuals["edited"] >= 30)]
     out = []
     for key, components, size in _KEYS[group]:
         times = mine.loc[mine["component"].isin(components), "rms_normalised"].to_numpy(float)
@@ -287,7 +286,7 @@ def _estimated(run: Run, name: str) -> list[str]:
         if error == row.name or "bias" not in error or pd.isna(row.estimate) or row.treated != "estimated":
             continue
         angle = str(row.unit).startswith("rad")
-        scale, unit = (180.0 / np.pi, str(row.unit).replace("rad", _DEG)) if angle else (1.0, str(row.unit))
+        scale, unit = (180.0 / np.pi, str(row.unit).replace("rad", "deg")) if angle else (1.0, str(row.unit))
         value, sd, prior = (scale * float(x) for x in (row.estimate, row.sd, row.prior_sd))
         out.append(f"# {error}: {value:+.3g} +/- {sd:.3g} {unit} in this flight; a priori sd {prior:.3g}")
     return out

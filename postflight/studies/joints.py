@@ -36,7 +36,6 @@ from synthetic_flight.scenarios import Scenario, child_rng, initial_state
 from synthetic_flight.weather import day_of_flight_atmosphere
 
 ABOUT_PEAK_S, RECORD_S = 20.0, 0.02
-MEAN_HALF_WINDOW_S = 1.5  # two periods of the aerodynamic mode to both sides of the peak
 LATER_S = (10.0, 20.0)  # after the peak: supersonic, where the bare airframe is unstable at small angles
 LOCKED = "locked (No CFE)"
 
@@ -160,7 +159,8 @@ def _table(flights: tuple[JointFlight, ...], peak_s: float) -> pd.DataFrame:
     pulse = flights[0].time_s[pressure_pulse(flights[0].pressure_pa)]
     rows = []
     for f in flights:
-        near = np.abs(f.time_s - peak_s) <= MEAN_HALF_WINDOW_S
+        # two periods of the aerodynamic mode to both sides of the peak
+        near = np.abs(f.time_s - peak_s) <= 1.5
         tumbling = f.alpha_total_deg > 90.0
         inside = (f.time_s >= pulse[0]) & (f.time_s <= pulse[-1])
         later = (f.time_s >= peak_s + LATER_S[0]) & (f.time_s <= peak_s + LATER_S[1])

@@ -57,7 +57,7 @@ RECORD_S, SPAN_S = 0.05, 70.0
 AIR_ROWS = int((START_ALTITUDE_M + 30e3 - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M) + 1
 # steps of a slow vehicle; of a faster one so many that it turns by `STEP_RAD` in each: fourth-order steps then err by
 # 1e-6 rad
-RIGID_STEP_S, FLEXIBLE_STEP_S, STEP_RAD = RECORD_S / 3.0, 0.005, 0.15
+STEP_RAD = 0.15
 ENTRIES = 300
 
 
@@ -169,7 +169,7 @@ class _Entry:
         self.profile = profile_from_sounding(flight.telemetry.sounding)
         self.at_start = resample(flight.solution.smoothed, np.array([self.start_s]))
         turning_radps = fastest_radps(vehicle, flight.solution, air)
-        steps = round(RECORD_S / (RIGID_STEP_S if self.locked else min(FLEXIBLE_STEP_S, resolving_step_s(vehicle))))
+        steps = 3 if self.locked else round(RECORD_S / min(0.005, resolving_step_s(vehicle)))
         steps = max(steps, int(np.ceil(RECORD_S * turning_radps / STEP_RAD)))
         self.schedule = Schedule(RECORD_S / steps, steps, self.records, self.records if self.locked else 0)
 
