@@ -176,9 +176,10 @@ def _rows(rerun: Rerun, base: Reconstruction, own: Reconstruction, other: Recons
         expected = float(np.sqrt(gained)) if gained > 0.02 * sd**2 else np.nan
         largest = int(np.nanargmax(np.abs(moved))) if np.isfinite(moved).any() else peak
         value = views[0].value[name][peak] if name in views[0].value else np.nan
+        here = moved[peak]
         row = (
-            rerun.name, name, unit, at[peak], value, sd, moved[peak], moved[peak] / sd, expected, moved[peak] / expected,
-            moved[largest], at[largest], "",
+            rerun.name, name, unit, at[peak], value, sd, here, here / sd, expected, here / expected, moved[largest],
+            at[largest], "",
         )  # fmt: skip
         out.append(dict(zip(COLUMNS, row, strict=True)))
     return out

@@ -79,7 +79,8 @@ _STEP_S = {
     word: step_s
     for step_s, words in (
         (86400.0, "d day days"), (3600.0, "h hr hour hours"), (60.0, "min minute minutes"),
-        (1.0, "s sec second seconds"), (1e-3, "ms msec millisecond milliseconds"), (1e-6, "us microsecond microseconds"),
+        (1.0, "s sec second seconds"), (1e-3, "ms msec millisecond milliseconds"),
+        (1e-6, "us microsecond microseconds"),
     )
     for word in words.split()
 }  # fmt: skip
