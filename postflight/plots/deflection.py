@@ -133,23 +133,13 @@ def _southwell(ax: Axes, limbs: Limbs) -> None:
     both = limbs.both
     clear = both.theta_rad > 2.0 * both.theta_sd_rad
     q, theta, sd = both.pressure_pa[clear], both.theta_rad[clear], both.theta_sd_rad[clear]
-    error = np.rad2deg(sd) / np.rad2deg(theta) ** 2
-    ax.errorbar(
-        1e3 / q,
-        1.0 / np.rad2deg(theta),
-        yerr=error,
-        fmt="o",
-        color=COLOUR["measured"],
-        label=f"means of {SPAN_S:g} s, 1 sd",
-    )
+    error, label = np.rad2deg(sd) / np.rad2deg(theta) ** 2, f"means of {SPAN_S:g} s, 1 sd"
+    ax.errorbar(1e3 / q, 1.0 / np.rad2deg(theta), yerr=error, fmt="o", color=COLOUR["measured"], label=label)
     over = np.linspace(1e3 / both.critical_pressure_pa, 1e3 / q.min() if len(q) else 5.0, 200)[1:]
-    for name, limb, colour in (
-        ("both", both, COLOUR["measured"]),
-        ("rise", limbs.rise, COLOUR["estimate"]),
-        ("fall", limbs.fall, COLOUR["second"]),
-    ):
+    shown = (("both", both, "measured"), ("rise", limbs.rise, "estimate"), ("fall", limbs.fall, "second"))
+    for name, limb, colour in shown:
         if limb is not None:
-            ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=colour, label=name, lw=1.0)
+            ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=COLOUR[colour], label=name, lw=1.0)
     low, high = both.critical_interval_pa
     ax.set(xlabel="1 / dynamic pressure (1/kPa)", ylabel="1 / deflection (1/deg)", xlim=(0.0, None), ylim=(0.0, None))
     words = f"{both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})"
@@ -188,12 +178,12 @@ def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
 
 # aerodynamic increments along Mach number
 
-_PANELS = (
-    ("C_A: increment (%)", 100.0),
-    ("C_N: increment (%)", 100.0),
-    ("C_m: increment (%)", 100.0),
-    ("C_mq: increment", 1.0),
-)
+_PANELS = {
+    "C_A: increment (%)": 100.0,
+    "C_N: increment (%)": 100.0,
+    "C_m: increment (%)": 100.0,
+    "C_mq: increment": 1.0,
+}
 
 
 @in_style
@@ -201,7 +191,7 @@ def figure_increments(increments: AeroIncrements) -> Figure:
     """Increments of the four coefficients along Mach number, before the flight and after it, with 1 sd."""
     figure = Figure(figsize=(9.6, 6.6))
     axes = figure.subplots(2, 2, sharex=True)
-    for k, (ax, (label, scale)) in enumerate(zip(axes.flat, _PANELS, strict=True)):
+    for k, (ax, (label, scale)) in enumerate(zip(axes.flat, _PANELS.items(), strict=True)):
         _along_mach(ax, increments, k, scale)
         ax.set_ylabel(label)
     for ax in axes[1]:

@@ -162,15 +162,12 @@ def figure_shell_test(found: ShellTest, title: str) -> Figure:
     shown = (("selected", selected, "second"), ("not selected", found.fits[0], "limit"))
     for name, fit, colour in shown if selected is not found.fits[0] else shown[1:]:
         label = f"{name}: {' and '.join(fit.laws) or 'straight spring'}, rms {100.0 * fit.rms_share:.1f} %"
-        ax.plot(
-            np.rad2deg(test.angle_rad - fit.residual_rad), test.moment_nm, color=COLOUR[colour], lw=1.0, label=label
-        )
+        fitted = np.rad2deg(test.angle_rad - fit.residual_rad)
+        ax.plot(fitted, test.moment_nm, color=COLOUR[colour], lw=1.0, label=label)
         left.plot(test.time_s, 100.0 * fit.residual_rad / test.largest_rad, color=COLOUR[colour], lw=1.0)
-    ax.set_xlabel("angle (deg)")
-    ax.set_ylabel("moment in the joint (N m)")
+    ax.set(xlabel="angle (deg)", ylabel="moment in the joint (N m)")
     ax.legend(fontsize=7)
     left.axhline(0.0, color=COLOUR["zero"], lw=0.8)
-    left.set_xlabel("time (s)")
-    left.set_ylabel("measured less fitted (% of the largest)")
+    left.set(xlabel="time (s)", ylabel="measured less fitted (% of the largest)")
     figure.suptitle(title)
     return figure

@@ -27,11 +27,8 @@ def figure_flown(flight: Reconstruction) -> Figure:
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
     fast.set(ylabel="ground speed (m/s)", ylim=(0, None))
-    for part, colour, label in (
-        (slice(0, 3), COLOUR["estimate"], "position (m)"),
-        (slice(3, 6), COLOUR["second"], "velocity (m/s)"),
-    ):
-        sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, part], axis=1), color=colour, label=label)
+    for first, colour, label in ((0, COLOUR["estimate"], "position (m)"), (3, COLOUR["second"], "velocity (m/s)")):
+        sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, first : first + 3], axis=1), color=colour, label=label)
     sure.set(ylabel="standard deviation", xlabel=TIME)
     sure.legend(loc="best")
     found = [f for f in flight.solution.findings if f.source == "motion"]
@@ -132,13 +129,11 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     height_km = column["altitude_m"] / 1000.0
     wind = profile_from_sounding(flight.telemetry.sounding).at(1000.0 * height_km).wind_ned_mps
     one = np.ones(len(height_km))
-    ratio_sd, prior_ratio_sd, prior_wind_sd = (
-        column[n] for n in ("density_ratio_sd", "density_ratio_prior_sd", "wind_prior_sd_mps")
-    )
-    _along_height(axes[0], height_km, (column["density_ratio"], ratio_sd), (one, prior_ratio_sd))
+    found = column["density_ratio"], column["density_ratio_sd"]
+    _along_height(axes[0], height_km, found, (one, column["density_ratio_prior_sd"]))
     for k, (ax, way) in enumerate(zip(axes[1:], ("north", "east"), strict=True)):
         found = wind[:, k] + column[f"wind_{way}_change_mps"], column[f"wind_{way}_sd_mps"]
-        _along_height(ax, height_km, found, (wind[:, k], prior_wind_sd))
+        _along_height(ax, height_km, found, (wind[:, k], column["wind_prior_sd_mps"]))
         ax.set_xlabel(f"wind velocity, {way} (m/s)")
     axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
     upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")

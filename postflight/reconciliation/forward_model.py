@@ -184,13 +184,10 @@ def _perturbed(
         for row, column, axes in ((0, 1, "xy"), (0, 2, "xz"), (1, 2, "yz")):
             inertia[row, column] += size * v[f"{name}'s product {axes}"]
             inertia[column, row] = inertia[row, column]
+    x += known.cg_station_m * v[f"station of the {name}'s c.g."]
     moved = {
         "mass_kg": part.mass_kg * (1.0 + known.mass * v[f"mass of the {name}"]),
-        "cg_from_datum_body_m": (
-            x + known.cg_station_m * v[f"station of the {name}'s c.g."],
-            y + float(lateral_m[0]),
-            z + float(lateral_m[1]),
-        ),
+        "cg_from_datum_body_m": (x, y + float(lateral_m[0]), z + float(lateral_m[1])),
         "inertia_kgm2": tuple(map(tuple, inertia.tolist())),
     }
     return part.model_copy(update=moved)
@@ -291,30 +288,23 @@ class AtmosphereParameters:
         return table
 
     def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
-        """Rows of a kernel table that change where one difference (log density, north, east wind) moves at one knot."""
-        near, hat = self._hats[knot]
+        """Rows of a kernel table that change where log density, north, east wind or temperature moves at one knot."""
+        near, hat = self._hats[kind == 3][knot]
         rows, change = table[near].copy(), step * hat
         if kind == 0:
             rows[:, 0] *= np.exp(change)
             rows[:-1, 1] += change[1:] - change[:-1]
+        elif kind == 3:
+            rows[:, 2] *= np.exp(0.5 * change / self._sounded[2][near])
         else:
             rows[:, 2 + kind] += change
         return MovedRows(near.start, rows)
 
-    def warmed_rows(self, table: FloatArray, knot: int, step_k: float) -> MovedRows:
-        """Rows of a kernel table that change where the temperature moves at one of its knots."""
-        near, hat = self._temperature_hats[knot]
-        rows = table[near].copy()
-        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded[2][near])
-        return MovedRows(near.start, rows)
-
     @cached_property
-    def _hats(self) -> list[tuple[slice, FloatArray]]:
-        return hats(self._sounded[1], self.knots_m)
-
-    @cached_property
-    def _temperature_hats(self) -> list[tuple[slice, FloatArray]]:
-        return hats(self._sounded[1], self.temperature_knots_m)
+    def _hats(self) -> tuple[list[tuple[slice, FloatArray]], list[tuple[slice, FloatArray]]]:
+        """`hats` of the knots, and of the temperature's."""
+        rows_m = self._sounded[1]
+        return hats(rows_m, self.knots_m), hats(rows_m, self.temperature_knots_m)
 
 
 def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArray]]:
@@ -705,16 +695,10 @@ def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
     v = at.velocity_ecef_mps[span] + motion[:, VELOCITY] + rotations.rotate(q, velocity)
     to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
     q_body = rotations.multiply(to_eci, q)
+    inertial = rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r))
+    q_shell = rotations.multiply(q_body, q_body_shell)
     return np.column_stack(
-        [
-            rotations.rotate(to_eci, r),
-            rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r)),
-            q_body,
-            rotations.multiply(q_body, q_body_shell),
-            omega,
-            shell_rate,
-            motion[:, CREEP],
-        ]
+        [rotations.rotate(to_eci, r), inertial, q_body, q_shell, omega, shell_rate, motion[:, CREEP]]
     )
 
 
@@ -742,13 +726,6 @@ def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> Fl
     _, from_datum = _cg_from_datum(flights, omega, q_body_shell, shell)
     r, v = rotations.rotate(to_ecef, state[:, 0:3]), rotations.rotate(to_ecef, state[:, 3:6])
     velocity = v - np.cross(earth.OMEGA_ECEF_RADPS, r) - rotations.rotate(q, from_datum)
-    return np.column_stack(
-        [
-            rotations.boxminus(q, at.q_ecef_body[span + 1]),
-            omega,
-            rotations.log(q_body_shell),
-            shell - rotations.rotate(rotations.conjugate(q_body_shell), omega),
-            velocity - at.velocity_ecef_mps[span + 1],
-            state[:, 20:],
-        ]
-    )
+    attitude, velocity = rotations.boxminus(q, at.q_ecef_body[span + 1]), velocity - at.velocity_ecef_mps[span + 1]
+    shell_rate = shell - rotations.rotate(rotations.conjugate(q_body_shell), omega)
+    return np.column_stack([attitude, omega, rotations.log(q_body_shell), shell_rate, velocity, state[:, 20:]])

@@ -61,7 +61,7 @@ VACUUM_SD = np.append(
 GUST_KNOT_M = 300.0
 MOTION_STEP = np.append(np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3)), [1e-3, 1e-3, 1e-3])
 LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
-VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4])
+VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4, 1e-2])
 
 
 @dataclass(frozen=True)
@@ -469,15 +469,10 @@ class Problem:
     def _moved_air(self, air: FloatArray, which: Index) -> tuple[list[MovedRows], FloatArray]:
         """What changes in a kernel table where parameters of the air (k,) move, counted from its first; their steps."""
         knots = len(self.air.knots_m)
-        kinds = np.minimum(which // knots, len(AIR_STEP))
-        steps = np.append(AIR_STEP, 1e-2)[kinds]
-        moved = [
-            self.air.moved_rows(air, kind, knot, step)
-            if kind < len(AIR_STEP)
-            else self.air.warmed_rows(air, knot, step)
-            for kind, knot, step in zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
-        ]
-        return moved, steps
+        kinds = np.minimum(which // knots, 3)
+        steps = AIR_STEP[kinds]
+        each = zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
+        return [self.air.moved_rows(air, *one) for one in each], steps
 
     @cached_property
     def _passed_knots(self) -> list[Index]:
