@@ -164,12 +164,8 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     step = np.diff(at)
     outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > 5.0 * np.median(step))  # a longer step is a gap
     y, z = (np.interp(t, at, theta * f(plane)) for f in (np.cos, np.sin))
-    values = (
-        np.hypot(y, z),
-        np.interp(t, at, table["theta_sd_deg"]),
-        np.mod(np.rad2deg(np.arctan2(z, y)), 360.0),
-        np.interp(t, at, table["plane_sd_deg"]),
-    )
+    theta_sd, plane_sd = (np.interp(t, at, table[name]) for name in ("theta_sd_deg", "plane_sd_deg"))
+    values = np.hypot(y, z), theta_sd, np.mod(np.rad2deg(np.arctan2(z, y)), 360.0), plane_sd
     return {key: np.where(outside, np.nan, value) for key, value in zip(keys, values, strict=True)}
 
 
@@ -376,17 +372,11 @@ def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> st
     return "".join(c if c.isprintable() and (c.isascii() or not ascii_only) else instead for c in text)
 
 
-# format: what writes it, the suffix of its file
-FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
-    "csv": (_csv, ".csv"),
-    "parquet": (_parquet, ".parquet"),
-    "mat": (_mat, ".mat"),
-    "nc": (_netcdf, ".nc"),
-    "kml": (_kml, ".kml"),
-    "oem": (_oem, ".oem"),
-    "aem": (_aem, ".aem"),
-    "msopck": (_msopck, ".msopck"),
-}
+# format, which is its file's suffix too: what writes it
+FORMS: dict[str, Callable[[Source], bytes]] = {
+    "csv": _csv, "parquet": _parquet, "mat": _mat, "nc": _netcdf, "kml": _kml, "oem": _oem, "aem": _aem,
+    "msopck": _msopck,
+}  # fmt: skip
 _OF_THE_EARTH = ("oem", "aem", "kml", "msopck")  # by their frames
 console = terminal()
 
@@ -402,14 +392,13 @@ def export(folder: Path, form: str, out: Path | None, run: str | None = None) ->
         Where the flight has no run with a trajectory.
     """
     source = read_source(folder, run)
-    write, suffix = FORMS[form]
     if form in _OF_THE_EARTH:
         earth.require_earth(source.header.get("planet", "earth"), f"--to {form}")
-    path = out or folder / "exports" / f"{source.run}{suffix}"
+    path = out or folder / "exports" / f"{source.run}.{form}"
     if (folder / "runs").resolve() in path.resolve().parents:
         raise ConfigError(f"{path}: run folders stay as they were written; name another place", "export-into-run")
     try:
-        content = write(source)
+        content = FORMS[form](source)
     except ImportError as fault:
         raise ConfigError(f"--to {form} {missing_library(fault)}", "library-missing") from None
     with writing(path, "name another place with --out"):

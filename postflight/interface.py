@@ -253,17 +253,11 @@ def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]
     if not use.any():
         raise GateError("compare: the two trajectories have no time of the pressure pulse in common", "no-common-time")
     apart = sizes_apart(resample(second.trajectory, t[use]), resample(first.trajectory, t[use]))
-    return [
-        (
-            f"largest difference of {column.split('_')[0]} over the pulse",
-            unit,
-            0.0,
-            np.nan,
-            float(apart[column].max()),
-            np.nan,
-        )
-        for column, unit, _ in APART
-    ]
+    rows: list[Row] = []
+    for column, unit, _ in APART:
+        name = f"largest difference of {column.split('_')[0]} over the pulse"
+        rows.append((name, unit, 0.0, np.nan, float(apart[column].max()), np.nan))
+    return rows
 
 
 def _deflection_rows(first: Deflections, second: Deflections) -> list[Row]:

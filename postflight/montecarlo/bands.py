@@ -74,14 +74,7 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     reasons = "\0".join(chunk.reasons).encode()
     try:
         with partial.open("wb") as file:
-            np.savez(
-                file,
-                runs=chunk.runs,
-                reasons=np.frombuffer(reasons, dtype=np.uint8),
-                diverged_s=chunk.diverged_s,
-                scalars=chunk.scalars,
-                histories=chunk.histories,
-            )
+            np.savez(file, **(vars(chunk) | {"reasons": np.frombuffer(reasons, dtype=np.uint8)}))
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)

@@ -63,11 +63,8 @@ def figure_residuals(flight: Reconstruction) -> Figure:
         ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
         ax.set_ylim(-limit, limit)
     axes[-1].set_xlabel(TIME)
-    return titled(
-        figure,
-        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside",
-        flight.flight,
-    )
+    title = "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside"
+    return titled(figure, title, flight.flight)
 
 
 def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) -> None:
@@ -112,11 +109,8 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     legend_above(grid[0, 0], 2)
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
-    return titled(
-        figure,
-        "Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)",
-        flight.flight,
-    )
+    title = "Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)"
+    return titled(figure, title, flight.flight)
 
 
 @in_style
@@ -228,9 +222,6 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     grid[0].invert_yaxis()
     for ax in grid[len(groups) :]:
         ax.set_visible(False)
-    return titled(
-        figure,
-        "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
-        "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
-        flight.flight,
-    )
+    title = "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
+    title += "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3"
+    return titled(figure, title, flight.flight)

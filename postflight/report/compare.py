@@ -18,11 +18,11 @@ from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
 from postflight.plots.style import LABEL, MANY, with_holes
-from postflight.report.compare_other import OTHER_TABLES, charts, compare_with_other, print_other
+from postflight.report.compare_other import OTHER_TABLES, compare_with_other, print_other
 from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
-from postflight.report.write import pulse_window, rendered
+from postflight.report.write import charts, pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import RunTables, find_run, is_complete, read_tables
 from postflight.systematic_differences import digits
@@ -223,7 +223,7 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
     spans = [run.tables["bet"]["t_s"] for run in compared.runs]
     whole = [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))]
     panels = [*_deflection_panels(compared), *_trajectory_panels(compared)]
-    data = charts(first, whole, pulse_window(bet), panels, _difference_panels(compared, over_time))
+    data = charts(first, whole, pulse_window(bet), panels, studies=_difference_panels(compared, over_time))
     return rendered(
         "compare.html",
         data,

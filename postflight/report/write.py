@@ -29,6 +29,7 @@ from postflight.plots.style import COLOUR, PAGE
 from postflight.report import text, view_3d
 from postflight.report.panels import (
     NO_DEFLECTION,
+    Panel,
     deflection_panel,
     residual_panels,
     rigid_panels,
@@ -37,6 +38,7 @@ from postflight.report.panels import (
     trajectory_rows,
 )
 from postflight.report.source import Run, read_run, rounded
+from postflight.runs import RunTables
 
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -187,25 +189,41 @@ def _numbers(
         absent.insert(0, ("deflection", "Deflection", NO_DEFLECTION))
     vehicle = run.telemetry.vehicle
     span = [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])]
+    data = charts(
+        run,
+        span,
+        span if deflection is None else pulse_window(bet),
+        panels,
+        bet=rounded(bet["t_s"].to_numpy()[rows], 4),
+        rows=[len(rows), len(bet)],
+        rigid=rigid_panels(run),
+        studies=study_panels(run, studies),
+        residuals=residual_panels(run),
+        solid=None if vehicle is None else view_3d.solid(vehicle),
+        poses=view_3d.poses(run, rows),
+        frames=[{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
+    )
+    return data, absent
+
+
+def charts(run: RunTables, span: list[float], first: list[float], panels: list[Panel], **more: Any) -> dict[str, Any]:
+    """What a page's scripts draw: whole time and the part shown first, events of a run, panels, and ``more``.
+
+    Only the report itself has columns of the trajectory (``bet``, ``rows``) and ``poses``.
+    """
     data = {
-        "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
+        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
         "span": span,
         "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": span if deflection is None else pulse_window(bet),
-        "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
-        "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
-        "rows": [len(rows), len(bet)],
+        "pulse": pulse_window(run.tables["bet"]),
+        "first": first,
+        "peak": round(run.peak_s, 3),
+        "bet": None, "rows": None,
         "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
         "panels": panels,
-        "rigid": rigid_panels(run),
-        "studies": study_panels(run, studies),
-        "residuals": residual_panels(run),
-        "solid": None if vehicle is None else view_3d.solid(vehicle),
-        "poses": view_3d.poses(run, rows),
-        "frames": [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
-    }
-    return data, absent
+        "rigid": [], "studies": [], "residuals": [], "solid": None, "poses": None, "frames": [],
+    } | more  # fmt: skip
+    return {key: value for key, value in data.items() if key in more or key not in ("bet", "rows", "poses")}
 
 
 def pulse_window(bet: pd.DataFrame) -> list[float]:
