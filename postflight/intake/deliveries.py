@@ -15,15 +15,13 @@ components along height; nothing is extrapolated. Wind directions stay where the
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 import shutil
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -91,10 +89,7 @@ def as_coefficients(table: FreeFormTable, columns: dict[str, str]) -> bytes:
     changed = [f"{old} as {new}" for old, new in zip(table.names, names, strict=True) if old != new]
     if changed:
         table.notes.append(f"columns renamed: {', '.join(changed)}")
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerows([names, *table.rows])
-    return out.getvalue().encode()
+    return replace(table, names=names, raw=None).as_csv()
 
 
 def sidecar_text(columns: dict[str, str]) -> str:
@@ -326,9 +321,9 @@ def frame_list(
 def _without_list(video: Video, folder: Path) -> str:
     """Return the comment for flight.toml where no list has the times of a video's frames."""
     place = video.place.relative_to(folder).as_posix()
-    what = "is a film" if video.is_film else f"holds {len(video.names)} pictures"
-    frame = "number" if video.is_film else "name"
-    key = "film" if video.is_film else "folder"
+    what, frame, key = f"holds {len(video.names)} pictures", "name", "folder"
+    if video.is_film:
+        what, frame, key = "is a film", "number", "film"
     return (
         f"# QUESTION: {place} {what}; when was each frame taken? A table t_s, frame (its {frame}) is wanted:\n"
         f'# [frames]\n# file = "telemetry/frames.csv"\n# {key} = "{place}"\n'
@@ -339,8 +334,7 @@ def _without_list(video: Video, folder: Path) -> str:
 def _cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
     """Names of the cameras in the vehicle file that flight.toml names; none where it cannot be read yet."""
     try:
-        made = read_toml(vehicle_path(str(tables.get("vehicle", "")), folder))
-        return list(made.get("cameras", {}))
+        return list(read_toml(vehicle_path(str(tables.get("vehicle", "")), folder)).get("cameras", {}))
     except (OSError, ValueError):
         return []
 
@@ -595,8 +589,8 @@ def _not_recognised(table: FreeFormTable, file: str) -> Fault:
         words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
         return Fault(words, "sounding-incomplete")
     if recogniser.time is None:
-        first = [(name, cells[0]) for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
-        shown = ", ".join(f"'{name}' {cell}" for name, cell in first)
+        first = [f"'{name}' {cells[0]}" for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
+        shown = ", ".join(first)
         words = (
             f"{file}: no column of times is recognised, and without one nothing else is (the first row has {shown}); "
             "docs/own-data.md lists the times that are read; or declare its columns in flight.toml"
@@ -608,12 +602,12 @@ def _not_recognised(table: FreeFormTable, file: str) -> Fault:
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:
     """``[start]`` where accelerometer and gyros with known units and seconds begin with a rest; else nothing."""
-    records = {}
-    for table, found, _ in shown:
-        for source in found:
-            record = _triad_of(table, source)
-            if record is not None:
-                records[source.section] = record
+    records = {
+        source.section: record
+        for table, found, _ in shown
+        for source in found
+        if (record := _triad_of(table, source)) is not None
+    }
     if not {"sensors.accelerometer", "sensors.rates"} <= set(records):
         return ""
     both = records["sensors.accelerometer"], records["sensors.rates"]
@@ -649,10 +643,8 @@ def _earlier_videos(folder: Path) -> list[Video]:
 
 
 def _sections(tables: dict[str, Any]) -> set[str]:
-    out: set[str] = {"atmosphere", "frames"} & set(tables)
-    for group in ("sensors", "radars", "gnss", "barometers"):
-        out |= {f"{group}.{name}" for name in tables.get(group, {})}
-    return out
+    groups = ("sensors", "radars", "gnss", "barometers")
+    return {"atmosphere", "frames"} & set(tables) | {f"{g}.{name}" for g in groups for name in tables.get(g, {})}
 
 
 def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> None:

@@ -107,11 +107,8 @@ def _print_merged(merged: Merged, folder: Path) -> None:
 def status(folder: Path) -> None:
     """Print how many flights of a folder are flown."""
     found = execution.status(folder)
-    console.print(
-        f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
-        f"{found.failed.total()} failed, {found.diverged} diverged",
-        highlight=False,
-    )
+    flown = f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks"
+    console.print(f"{flown}; {found.failed.total()} failed, {found.diverged} diverged", highlight=False)
     for reason, count in found.failed.most_common(5):
         console.print(f"[red]failed[/] {count} times: {escape(reason)}")
 

@@ -83,33 +83,18 @@ PAGE = {
 OVER_FRAME = {"used": _GREEN, "left": _VERMILION, "outline": _YELLOW, "marks": _SKY}
 
 LABEL = {
-    "camera": "video (virtual camera)",
-    "misalignment": "accelerometers (misalignment)",
-    "trim": "trim angle",
+    "camera": "video (virtual camera)", "misalignment": "accelerometers (misalignment)", "trim": "trim angle",
     "fused": "all fused",
-}
+}  # fmt: skip
 STROKE = {"camera": "-", "misalignment": "--", "trim": "-.", "fused": "-"}
 TIME = "time after launch (s)"
 BAND, WIDE_BAND = 0.2, 0.15  # opacities: of one band, and of several that overlap
 _PARAMETERS: dict[Any, Any] = {
-    "figure.constrained_layout.use": True,
-    "figure.titlesize": 10,
-    "font.size": 9.5,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.3,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "lines.linewidth": 1.2,
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "legend.title_fontsize": 8,
-    "legend.loc": "upper left",
-}
+    "figure.constrained_layout.use": True, "figure.titlesize": 10, "font.size": 9.5, "lines.linewidth": 1.2,
+    "axes.titlesize": 9, "axes.labelsize": 9, "axes.grid": True, "axes.axisbelow": True, "grid.alpha": 0.3,
+    "axes.spines.top": False, "axes.spines.right": False, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5,
+    "legend.frameon": False, "legend.fontsize": 8, "legend.title_fontsize": 8, "legend.loc": "upper left",
+}  # fmt: skip
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 

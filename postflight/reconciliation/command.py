@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from rich.markup import escape
 
-from flightmodel.checks import GateError, Progress, check_type
+from flightmodel.checks import GateError, Progress, check_type, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
@@ -101,10 +101,9 @@ class Reconciliation(Tabular):
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
         report = progress or (lambda _fraction, _what: None)
-        rigid = entry_bounds(self.bet, None, flights, progress=lambda f, what: report(0.3 * f, what))
+        rigid = entry_bounds(self.bet, None, flights, progress=part_of(report, 0.0, 0.3))
         laws, vehicle = dispersed(self.fit)
-        flexible = lambda f, what: report(0.3 + 0.7 * f, what)  # noqa: E731
-        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=flexible, vehicle=vehicle)
+        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=part_of(report, 0.3, 1.0), vehicle=vehicle)
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""

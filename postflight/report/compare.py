@@ -17,9 +17,9 @@ from flightmodel.checks import ConfigError, Fault, GateError
 from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
-from postflight.plots.style import LABEL, MANY, with_holes
+from postflight.plots.style import LABEL, MANY
 from postflight.report.compare_other import OTHER_TABLES, compare_with_other, print_other
-from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn
+from postflight.report.panels import Panel, drawn_answer, line_of, panel_of, quantities_drawn
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
 from postflight.report.write import charts, pulse_window, rendered
@@ -32,7 +32,6 @@ PAGE_NAME = "compare.html"
 TABLES = ("runs", "differences", "differences_over_time", "checks")
 _FILES = {PAGE_NAME, *(f"{name}.csv" for name in (*TABLES, *OTHER_TABLES))}
 _DASHES: tuple[list[int], ...] = ([], [8, 4], [2, 3], [10, 3, 2, 3], [5, 2], [14, 4])
-_ROWS = 3000  # of a line that are drawn
 # panels of differences: title, unit, column of the table of differences over time
 _APART = (
     ("Position, distance", "m", "position_m"),
@@ -207,10 +206,8 @@ def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str
     if not (np.isfinite(high) and high > 0.0):
         return [f"{change:+.2f}", ""]
     shown = digits(high)
-    return [
-        f"{change:+.{shown}f}",
-        f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}",
-    ]
+    spread = f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}"
+    return [f"{change:+.{shown}f}", spread]
 
 
 # the page
@@ -258,10 +255,6 @@ def _value_names(compared: RunComparison) -> list[str]:
     return names
 
 
-def _look(number: int) -> tuple[str, list[int]]:
-    return MANY[number % len(MANY)], _DASHES[number % len(_DASHES)]
-
-
 def _overlay(compared: RunComparison, name: str, title: str, unit: str, drawn: list[Any]) -> list[Panel]:
     """One panel with a line a run: times, values and sds of each, None for a run without; none where no run has any."""
     lines = []
@@ -269,9 +262,8 @@ def _overlay(compared: RunComparison, name: str, title: str, unit: str, drawn: l
         if found is None or not np.isfinite(found[1]).any():
             continue
         t, values, sd = found
-        rows, (colour, dash) = kept_rows([values], _ROWS), _look(k)
-        thin_sd = None if sd is None else sd[rows]
-        one = line_of(compared.labels[k], values[rows], thin_sd, colour, dash, 4)
+        rows = kept_rows([values], 3000)
+        one = line_of(compared.labels[k], values[rows], None if sd is None else sd[rows], MANY[k], _DASHES[k], 4)
         lines.append(one | {"t": rounded(t[rows], 4)})
     return [panel_of(name, title, unit, None, lines, [])] if lines else []
 
@@ -280,20 +272,11 @@ def _deflection_panels(compared: RunComparison) -> list[Panel]:
     """One panel a method."""
     out = []
     for method in METHODS[::-1]:
-        drawn = [_answer(run, method) for run in compared.runs]
+        tables = [run.tables.get(answer_table(method, run.tables)) for run in compared.runs]
+        drawn = [None if table is None or not len(table) else drawn_answer(table) for table in tables]
         panels = _overlay(compared, f"by_{method}", f"Deflection, {LABEL[method]}", "deg", drawn)
         out += [panel | {"floor": 0} for panel in panels]
     return out
-
-
-def _answer(run: RunTables, method: str) -> Any:
-    table = run.tables.get(answer_table(method, run.tables))
-    if table is None or not len(table):
-        return None
-    t, (theta, sd) = with_holes(
-        table["t_s"].to_numpy(float), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
-    )
-    return t, theta, sd
 
 
 def _trajectory_panels(compared: RunComparison) -> list[Panel]:

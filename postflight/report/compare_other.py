@@ -23,7 +23,6 @@ from postflight.systematic_differences import SystematicDifferences, digits, sys
 from postflight.terminal import terminal
 
 OTHER_TABLES = ("systematic_differences", "chi_square", "differences_over_time")
-_ROWS = 3000  # of a line that are drawn
 _TITLES = {"position": ("Position", "m"), "velocity": ("Velocity", "m/s"), "attitude": ("Rotation about body", "deg")}
 console = terminal()
 
@@ -124,7 +123,7 @@ def _panels(found: SystematicDifferences, table: pd.DataFrame) -> list[Panel]:
         group, axis = str(column).split("_")[:2]
         stem, unit = f"{group}_{axis}", str(column).rpartition("_")[2]
         values, left, sd = (table[f"{stem}{what}_{unit}"].to_numpy(float) for what in ("", "_left", "_sd"))
-        rows = kept_rows([values, left], _ROWS)
+        rows = kept_rows([values, left], 3000)
         drawn: list[tuple[str, FloatArray, FloatArray | None, str, list[int]]] = [
             ("both covariances" if found.both_stated else "run's covariance", 0.0 * sd, sd, COLOUR["prior"], [2, 3]),
             ("as given", values, None, COLOUR["second"], [8, 4]),

@@ -142,13 +142,8 @@ def _points(label: str, time_s: FloatArray, values: FloatArray, colour: str, dec
     known = np.isfinite(values)
     time_s, values = time_s[known], values[known]
     rows = kept_rows([values], limit) if len(values) else np.empty(0, dtype=int)
-    return {
-        "label": label,
-        "t": rounded(time_s[rows], 4),
-        "y": rounded(values[rows], decimals),
-        "colour": colour,
-        "of": len(values),
-    }
+    t, y = rounded(time_s[rows], 4), rounded(values[rows], decimals)
+    return {"label": label, "t": t, "y": y, "colour": colour, "of": len(values)}
 
 
 def deflection_panel(run: Run) -> Panel | None:
@@ -165,9 +160,7 @@ def deflection_panel(run: Run) -> Panel | None:
         if table is not frames:
             t, theta = (frames[c].to_numpy(float) for c in ("t_s", "theta_deg"))
             dots.append(_points("frames", t, theta, COLOUR[method], 4, _RAW_POINTS))
-        t, (theta, sd) = with_holes(
-            table["t_s"].to_numpy(), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
-        )
+        t, theta, sd = drawn_answer(table)
         rows = kept_rows([theta], _TRAJECTORY_ROWS // 2)
         one = line_of(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
         # frames are few: each is a dot, which also sets the line apart without colours
@@ -177,6 +170,13 @@ def deflection_panel(run: Run) -> Panel | None:
         return None
     out = panel_of("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
+
+
+def drawn_answer(table: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, angles and their sd, (n,) s and deg, of a table of answers; NaN in its holes."""
+    columns = [table[name].to_numpy(float) for name in ("theta_deg", "theta_sd_deg")]
+    t, (theta, sd) = with_holes(table["t_s"].to_numpy(float), columns)
+    return t, theta, sd
 
 
 def residual_panels(run: Run) -> list[Panel]:

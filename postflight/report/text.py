@@ -143,9 +143,8 @@ def _oscillation(run: Run) -> str:
 
 def _outside_its_inputs(run: Run) -> str:
     """Sentence on a fused angle beyond those of all methods, and why; empty where it lies among them."""
-    answers = {
-        name: m["deflection_deg"] for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None
-    }
+    methods = run.summary["methods"]
+    answers = {name: angle for name, m in methods.items() if (angle := m["deflection_deg"]) is not None}
     fused = answers.pop("fused", None)
     if fused is None or len(answers) < 2 or min(answers.values()) <= fused <= max(answers.values()):
         return ""
@@ -228,18 +227,14 @@ def plane_at(run: Run, method: str) -> str:
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
 
-def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
-    """Common scale of the cards' whiskers, deg: all intervals of 5 to 95 % with a margin."""
-    ends = [end for c in shown if "number" in c for end in (*c["quantiles"], c["number"])]
-    if not ends:
-        return 0.0, 1.0
-    margin = 0.06 * (max(ends) - min(ends)) + 0.01
-    return min(ends) - margin, max(ends) + margin
-
-
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 5 to 95 % as a band behind each."""
-    least, most = _scale(shown)
+    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 5 to 95 % as a band behind each.
+
+    The scale, deg, is common: all intervals of 5 to 95 % with a margin.
+    """
+    ends = [end for c in shown if "number" in c for end in (*c["quantiles"], c["number"])] or [0.0, 1.0]
+    margin = 0.06 * (max(ends) - min(ends)) + 0.01
+    least, most = min(ends) - margin, max(ends) + margin
     place = lambda x: round(200.0 * (x - least) / (most - least), 1)  # noqa: E731
     fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
     for c in shown:

@@ -231,10 +231,8 @@ def pulse_window(bet: pd.DataFrame) -> list[float]:
     t = bet["t_s"].to_numpy()
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
     width = inside[-1] - inside[0]
-    return [
-        round(float(max(inside[0] - 0.75 * width, t[0])), 3),
-        round(float(min(inside[-1] + 0.5 * width, t[-1])), 3),
-    ]
+    first, last = max(inside[0] - 0.75 * width, t[0]), min(inside[-1] + 0.5 * width, t[-1])
+    return [round(float(first), 3), round(float(last), 3)]
 
 
 def safe_json(value: Any) -> str:

@@ -147,13 +147,9 @@ def compared_with_bounds(
 ) -> tuple[pd.DataFrame, pd.DataFrame, Drawing]:
     """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and what draws both."""
     pulse = flight.required_loads()
-    flown = pd.DataFrame(
-        {
-            "time_s": pulse.time_s,
-            "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
-            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2,
-        }
-    )
+    alpha_deg = np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad))
+    normal_g = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
+    flown = pd.DataFrame({"time_s": pulse.time_s, "alpha_total_deg": alpha_deg, "normal_g": normal_g})
     table = shares(flight, flown, rigid, flexible)
     remark = "inside, of the pulse: " + "; ".join(
         f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
