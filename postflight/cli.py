@@ -90,18 +90,11 @@ def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
     "--until-width", metavar="OUTPUT=WIDTH", help="Stop once the 97.7th percentile's 95 % interval is this narrow."
 )
 @workers_and_scheduler
-def montecarlo_run(
-    dispersions: str,
-    folder: Path,
-    flights: int | None,
-    until_width: str | None,
-    workers: int | None,
-    scheduler: str | None,
-) -> None:
+def montecarlo_run(**options: Any) -> None:
     """Fly what is missing of DISPERSIONS in FOLDER, then write percentiles, intervals and bands."""
     from postflight.montecarlo import commands
 
-    commands.run(dispersions, folder, flights, workers, scheduler, until_width)
+    commands.run(**options)
 
 
 @montecarlo.command(name="status")
@@ -149,12 +142,9 @@ def study_table_3_1(folder: Path, vehicle: str) -> None:
 
 def scenario_and_seed(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say what is flown."""
-    command = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")(
-        command
-    )
-    return click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")(
-        command
-    )
+    seed = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")
+    scenario = click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")
+    return scenario(seed(command))
 
 
 @study.command(name="damping")
@@ -164,7 +154,7 @@ def study_damping(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack with 0.5 to 20 % damping at 2.5 Hz (Figure 3.1), into FOLDER."""
     from postflight.studies import commands
 
-    commands.damping(scenario, folder, seed)
+    commands.joint_study("damping", scenario, folder, seed)
 
 
 @study.command(name="stiffness")
@@ -174,7 +164,7 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack and normal acceleration from 2 to 4 Hz at 0.5 % (Figures 3.2, 3.3), into FOLDER."""
     from postflight.studies import commands
 
-    commands.stiffness(scenario, folder, seed)
+    commands.joint_study("stiffness", scenario, folder, seed)
 
 
 @study.command(name="shell-test")
@@ -191,13 +181,11 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
 @click.option(
     "--arm-m", type=click.FloatRange(min=0.0, min_open=True), help="Arm about the joint of force and displacement."
 )
-def study_shell_test(
-    table: Path, folder: Path, time: str, load: str, displacements: tuple[str, ...], arm_m: float | None
-) -> None:
+def study_shell_test(**options: Any) -> None:
     """Which joint has a shell by its load test on the ground (TABLE, a CSV of load and displacement)? Into FOLDER."""
     from postflight.studies import commands
 
-    commands.shell_test(table, folder, time, load, displacements, arm_m)
+    commands.shell_test(**options)
 
 
 @study.command(name="preflight")
@@ -211,10 +199,6 @@ def study_preflight(flight: Path, folder: Path, dispersions: str, flights: int, 
     from postflight.studies import commands
 
     commands.preflight(flight, folder, dispersions, flights, seed)
-
-
-# heavy imports stand inside the commands, so that --help answers at once
-EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
 
 class FiniteRange(click.FloatRange):
@@ -319,21 +303,15 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option(
-    "--method",
-    "methods",
-    type=NamedChoice(["camera", "misalignment", "trim", "fused"]),
-    multiple=True,
+    "--method", "methods", type=NamedChoice(["camera", "misalignment", "trim", "fused"]), multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
-)
+)  # fmt: skip
 @click.option(
-    "--plane",
-    type=FiniteRange(-360.0, 360.0),
+    "--plane", type=FiniteRange(-360.0, 360.0),
     help="Assume this plane for the camera (LV clocking, deg); default: find it.",
-)
+)  # fmt: skip
 @click.option(
-    "--joint",
-    type=FiniteRange(0.0),
-    help="Assume the joint this far aft of the nose, m; default: the vehicle file's.",
+    "--joint", type=FiniteRange(0.0), help="Assume the joint this far aft of the nose, m; default: the vehicle file's."
 )
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
@@ -421,11 +399,9 @@ def score(folder: Path, as_json: bool, wanted: str | None) -> None:
 @click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: in the run's folder.")
 @click.option("--notebook", is_flag=True, help="Write a Jupyter notebook filled in for this flight instead.")
 @click.option(
-    "--bands",
-    multiple=True,
-    type=click.Path(exists=True, path_type=Path),
+    "--bands", multiple=True, type=click.Path(exists=True, path_type=Path),
     help="Folder of a Monte Carlo study or a reconciliation to hold the flight against.",
-)
+)  # fmt: skip
 @of_run
 def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path, ...], wanted: str | None) -> None:
     """Write the report of a run, the last complete one, of the flight in FOLDER: one HTML file, no network needed."""
@@ -436,10 +412,8 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
     if notebook and bands:
         raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
     run = find_run(folder, wanted)
-    if notebook:
-        write_out(f"report in {write_notebook(folder, output, run)}\n")
-    else:
-        write_out(f"report in {write_report(folder, run, target=output, studies=bands)}\n")
+    written = write_notebook(folder, output, run) if notebook else write_report(folder, run, None, output, bands)
+    write_out(f"report in {written}\n")
 
 
 @cli.command()
@@ -527,14 +501,13 @@ cli.add_command(montecarlo)
 cli.add_command(study)
 
 
-_AGAIN_S = 0.02  # after which a signal that came where nothing may be raised is tried again
 _BINDINGS = f"{os.sep}llvmlite{os.sep}binding{os.sep}"
 
 
 def terminate(number: int, frame: FrameType | None) -> None:
     """Leave as after Ctrl-C, so that what is half-written is removed; exit code as the shell gives it."""
     if not _postponed(number, frame):
-        sys.exit(EXIT_TERMINATED)
+        sys.exit(143)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -565,7 +538,7 @@ def unraisable(lost: Any) -> None:
 
 
 def _try_again(number: int) -> None:
-    again = threading.Timer(_AGAIN_S, _send_again, (number,))
+    again = threading.Timer(0.02, _send_again, (number,))
     again.daemon = True
     again.start()
 
@@ -594,7 +567,7 @@ def main() -> None:
         sys.exit(stop.exit_code)
     except (click.exceptions.Abort, KeyboardInterrupt):
         write_out("interrupted; nothing half-written is left\n", sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(130)
     except click.ClickException as fault:
         fault.show()
         sys.exit(fault.exit_code)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
+from rich.table import Table
 
 from flightmodel.checks import Progress
 from postflight.streams import into_nothing, visible
@@ -34,6 +35,18 @@ class Terminal(Console):
     def coded(self, mark: str, words: str, code: str = "") -> None:
         """Print a finding, refusal or failed check behind its mark, with its code in brackets at the end."""
         self.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
+
+    def table(
+        self, title: str, names: Iterable[str], rows: Iterable[Iterable[object]], words: Collection[str] = ()
+    ) -> None:
+        """Print a table: its first column and those named in ``words`` are texts, the others numbers."""
+        printed = Table(title=escape(title))
+        for k, name in enumerate(names):
+            is_text = not k or name in words
+            printed.add_column(name, justify="left" if is_text else "right", no_wrap=not k)
+        for row in rows:
+            printed.add_row(*(escape(str(cell)) for cell in row))
+        self.print(printed)
 
     def on_broken_pipe(self) -> None:
         """Go on: results are written to files, whoever reads."""

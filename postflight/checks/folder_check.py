@@ -181,7 +181,8 @@ def _vehicle_faults(folder: Path) -> list[Issue]:
 
 
 def _refuse(report: Report, folder: Path, faults: Sequence[Issue], code: int) -> None:
-    report.fill_in = placeholders(folder)
+    still_open = placeholders(folder)
+    report.fill_in = [f"{path}: key '{key}' {FILL_IN}" for path, keys in still_open.items() for key in keys]
     report.refused = [fault for fault in faults if FILL_IN not in fault]
     report.exit_code = code
 

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
 from postflight.commands import compile_kernels, console
@@ -22,11 +21,12 @@ from synthetic_flight.ensemble import available_cores, check_outputs
 
 
 def run(
-    name: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None, until: str | None
-) -> None:
+    dispersions: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None,
+    until_width: str | None,
+) -> None:  # fmt: skip
     """Fly what is missing and merge."""
-    study = read_study(name)
-    stop = study.spec.stop if until is None else stop_from(until, study)
+    study = read_study(dispersions)
+    stop = study.spec.stop if until_width is None else stop_from(until_width, study)
     wanted = Wanted(flights or study.spec.flights, workers or available_cores(), scheduler, stop)
     count = fly(study, folder, wanted)
     finish(study, folder, count)
@@ -86,14 +86,12 @@ def _origin(study: Study) -> str:
 
 def _print_merged(merged: Merged, folder: Path) -> None:
     """Percentiles with their intervals, and what failed."""
-    table = Table(title=f"{merged.summary['flights']} flights: percentiles")
-    for name in ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last"):
-        table.add_column(name, justify="left" if name == "output" else "right", no_wrap=name == "output")
-    for output, rows in merged.percentiles.groupby("output", sort=False):
-        last = rows.iloc[-1]
-        ends = (f"{'open' if np.isnan(x) else f'{x:.4g}'}" for x in (last["low_95"], last["high_95"]))
-        table.add_row(escape(str(output)), *(f"{value:.4g}" for value in rows["value"]), " to ".join(ends))
-    console.print(table)
+    rows = []
+    for output, band in merged.percentiles.groupby("output", sort=False):
+        ends = ("open" if np.isnan(x) else f"{x:.4g}" for x in band.iloc[-1][["low_95", "high_95"]])
+        rows.append((output, *(f"{value:.4g}" for value in band["value"]), " to ".join(ends)))
+    names = ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last")
+    console.table(f"{merged.summary['flights']} flights: percentiles", names, rows)
     for name, row in merged.summary.get("coverage", {}).items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()), highlight=False)
     if merged.summary["diverged"]:
@@ -107,11 +105,8 @@ def _print_merged(merged: Merged, folder: Path) -> None:
 def status(folder: Path) -> None:
     """Print how many flights of a folder are flown."""
     found = execution.status(folder)
-    console.print(
-        f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
-        f"{found.failed.total()} failed, {found.diverged} diverged",
-        highlight=False,
-    )
+    flown = f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks"
+    console.print(f"{flown}; {found.failed.total()} failed, {found.diverged} diverged", highlight=False)
     for reason, count in found.failed.most_common(5):
         console.print(f"[red]failed[/] {count} times: {escape(reason)}")
 

@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
-from flightmodel.checks import Check, GateError, Progress, check_type
+from flightmodel.checks import Check, GateError, Progress, check_type, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
@@ -61,7 +60,6 @@ LAW_NAMES = {
 }
 CONFIDENCE = 0.999  # as the reconstruction's checks
 MOST_OFF_SD = 4.0  # as the camera's time bias
-MOST_BY_STEPS_SD = 0.5  # which widens an interval by an eighth; the fit corrects what is above a tenth
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay) or creep (--creep), than was fitted; mass properties or sensors' places "
@@ -102,10 +100,9 @@ class Reconciliation(Tabular):
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
         report = progress or (lambda _fraction, _what: None)
-        rigid = entry_bounds(self.bet, None, flights, progress=lambda f, what: report(0.3 * f, what))
+        rigid = entry_bounds(self.bet, None, flights, progress=part_of(report, 0.0, 0.3))
         laws, vehicle = dispersed(self.fit)
-        flexible = lambda f, what: report(0.3 + 0.7 * f, what)  # noqa: E731
-        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=flexible, vehicle=vehicle)
+        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=part_of(report, 0.3, 1.0), vehicle=vehicle)
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
@@ -257,13 +254,12 @@ def _posterior_summary(posterior: Posterior | None) -> dict[str, object]:
 
 def _print_posterior(posterior: Posterior) -> None:
     """Table of the samples beside the linear problem."""
-    printed = Table(title="Posterior (emcee)")
-    for name in ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in posterior_summary(posterior).itertuples(index=False):
         interval = f"{r.low:.4g} to {r.high:.4g}"
-        printed.add_row(r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval)
-    console.print(printed)
+        rows.append((r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval))
+    names = ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval")
+    console.table("Posterior (emcee)", names, rows)
 
 
 def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
@@ -296,16 +292,14 @@ def _summary(
 
 def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> None:
     """Table of the joint, and the odds of the laws that were asked for."""
-    printed = Table(title="The joint that explains the flight")
-    for name in ("quantity", "vehicle file", "found", "1 sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in table.itertuples(index=False):
-        name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
+        found = f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}"
         if r.kind == "lower bound":
-            printed.add_row(name, f"{r.told:.4g}", f"above {r.low:.3g}", "", "95 % lower bound")
-            continue
-        printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
-    console.print(printed)
+            found = f"above {r.low:.3g}", "", "95 % lower bound"
+        rows.append((f"{r.quantity} ({r.unit})" if r.unit else r.quantity, f"{r.told:.4g}", *found))
+    names = ("quantity", "vehicle file", "found", "1 sd", "90 % interval")
+    console.table("The joint that explains the flight", names, rows)
     for law, name in LAW_NAMES.items():
         if law not in odds:
             continue
@@ -375,14 +369,17 @@ def _spans(fit: JointFit) -> Check:
 
 
 def _steps(fit: JointFit) -> tuple[Check, ...]:
-    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded."""
+    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded.
+
+    Half a sd widens an interval by an eighth; the fit corrects what is above a tenth.
+    """
     if fit.problem.held:
         return ()
     moved = np.abs(fit.moves_by_steps_sd)
     name = fit.problem.vehicle_parameters.names[int(np.argmax(moved))]
     return (
         Check.of(
-            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
+            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, 0.5,
             "finer integration steps move no estimate", f"finer integration steps move {name}",
             advice="the fit's own steps are too long for this motion: its intervals do not hold", component=name,
         ),

@@ -42,11 +42,7 @@ _LOADS = {"n": ("force", 1.0), "kn": ("force", 1e3), "lbf": ("force", 4.44822161
 }  # fmt: skip
 LEAST_ROWS, MOST_ROWS = 20, 2000  # more rows than that are thinned: their residuals are no more independent
 MOST_SHARE = 0.9  # as the vehicle file
-STARTS = (0.03, 0.3)  # first time constants, of the length of the test
 AT_BOUND = 0.02  # of a logarithm
-CUBIC_STEPS = 60
-# over which errors may last: from what is white to what lasts as long as the test; how many lengths are tried
-SHORTEST_ROWS, LONGEST_OF_TEST, PERSISTENCES = 0.2, 1.0, 40
 
 
 @dataclass(frozen=True)
@@ -253,7 +249,8 @@ def _fitted(test: LoadTest, laws: tuple[str, ...]) -> LawFit:
     if "creep" in laws:
         lower, upper = [*lower, 0.0, low, -np.inf], [*upper, MOST_SHARE / (1.0 - MOST_SHARE), high, np.inf]
         length = float(np.ptp(test.time_s))
-        starts = [[*starts[0], 0.3, float(np.clip(np.log(part * length), low, high)), 0.0] for part in STARTS]
+        # first time constants, of the length of the test: a few percent, and a third
+        starts = [[*starts[0], 0.3, float(np.clip(np.log(part * length), low, high)), 0.0] for part in (0.03, 0.3)]
     if "hardening" in laws:
         lower, upper, starts = [*lower, 0.0], [*upper, np.inf], [[*start, 0.1] for start in starts]
 
@@ -280,7 +277,8 @@ def _persistence(slope: FloatArray, off: FloatArray) -> tuple[float, float]:
         return np.concatenate([values[:1], (values[1:] - keep * values[:-1]) / np.sqrt(1.0 - keep**2)])
 
     best = -np.inf, 0.0, 0.0
-    for keep in np.exp(-1.0 / np.geomspace(SHORTEST_ROWS, LONGEST_OF_TEST * n, PERSISTENCES)).tolist():
+    # errors may last from a fifth of a row, which is white, to the length of the test
+    for keep in np.exp(-1.0 / np.geomspace(0.2, n, 40)).tolist():
         q, r = np.linalg.qr(whitened(slope, keep))
         left = whitened(off, keep)
         square = float(left @ left - np.sum((q.T @ left) ** 2))
@@ -318,7 +316,7 @@ def predicted(test: LoadTest, laws: tuple[str, ...], x: FloatArray) -> FloatArra
 def _cubic(load: FloatArray, cubic: float) -> FloatArray:
     """Root (n,) of ``d + cubic d^3 = load`` by Newton's steps, for a cubic term of no negative sign."""
     d = load.copy()
-    for _ in range(CUBIC_STEPS):
+    for _ in range(60):
         step = (d + cubic * d**3 - load) / (1.0 + 3.0 * cubic * d * d)
         d -= step
         if np.abs(step).max() < 1e-12 * max(1.0, np.abs(d).max()):

@@ -59,7 +59,7 @@ def test_a_planted_digit_is_seen(monkeypatch):
 
 
 def test_damping_study_says_what_the_paper_says(tmp_path):
-    commands.damping(VEHICLE, tmp_path, 0)
+    commands.joint_study("damping", VEHICLE, tmp_path, 0)
     table, paper = pd.read_csv(tmp_path / "damping.csv"), pd.read_csv(tmp_path / "damping_paper.csv")
     assert table["joint"].tolist() == [joints.LOCKED, "0.5 %", "1 %", "2.5 %", "5 %", "10 %", "20 %"]
     assert paper["agrees"].all()
@@ -72,7 +72,7 @@ def test_damping_study_says_what_the_paper_says(tmp_path):
 
 
 def test_stiffness_study_says_what_the_paper_says_where_it_can(tmp_path):
-    commands.stiffness(VEHICLE, tmp_path, 0)
+    commands.joint_study("stiffness", VEHICLE, tmp_path, 0)
     table = pd.read_csv(tmp_path / "stiffness.csv").set_index("joint")
     paper = pd.read_csv(tmp_path / "stiffness_paper.csv")
     assert paper["agrees"].tolist() == [True, False, True]  # the excursion is larger than flown: docs/studies.md

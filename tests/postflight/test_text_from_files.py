@@ -160,7 +160,7 @@ def test_a_globe_shows_names_as_text():
     events = pd.DataFrame({"event": [name], "t_s": [0.5]})
     header = {"point": "<i>datum</i>"}
     source = exports.Source(name, "run", datetime(2009, 8, 17, tzinfo=UTC), "", True, header, place, events, {}, t, t)
-    root = ET.fromstring(exports.FORMS["kml"][0](source))
+    root = ET.fromstring(exports.FORMS["kml"](source))
     for element in root.iter():
         kind = element.tag.rsplit("}", 1)[1]
         if kind in ("name", "description"):

@@ -254,7 +254,7 @@ def test_errors_of_any_correlation_in_time_stay_within_what_is_allowed(run, othe
 @pytest.mark.parametrize("form", ["oem", "csv", "nc"])
 def test_a_runs_own_export_reads_back_as_itself(reported, run, tmp_path, form):
     source = exports.read_source(reported)
-    (tmp_path / f"x.{form}").write_bytes(exports.FORMS[form][0](source))
+    (tmp_path / f"x.{form}").write_bytes(exports.FORMS[form](source))
     theirs = read_other(tmp_path / f"x.{form}", source.header["epoch_utc"])
     path, times, covariance = run
     np.testing.assert_allclose(theirs.time_s, path.time_s, atol=2e-6)
@@ -354,7 +354,7 @@ def test_a_covariance_in_another_frame_is_left_out_and_said(tmp_path):
 
 def test_the_command_writes_tables_and_one_page_that_needs_nothing(reported, tmp_path, capsys, monkeypatch):
     source = exports.read_source(reported)
-    lines = exports.FORMS["oem"][0](source).decode()
+    lines = exports.FORMS["oem"](source).decode()
     hostile = tmp_path / f"{HOSTILE.replace('/', '_')}.oem"
     hostile.write_text(lines)
     start = runner(capsys, monkeypatch)
