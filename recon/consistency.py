@@ -41,11 +41,12 @@ from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding
+from recon import _filter_kernels
 from recon._measurement_kernels import DECELERATION, RADAR
-from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem, jacobian
 from recon.measurements import REST, SLOT_NAMES
-from recon.settings import COMPILED, Settings
-from recon.smoother import Smoothed, backward, jacobian, two_filter
+from recon.settings import Settings
+from recon.smoother import Smoothed, two_filter
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
@@ -414,7 +415,7 @@ def _look_alikes(problem: Problem, innovations: Innovations, number: int, compon
     return sorted((name for name, c in alike.items() if c > _ALIKE), key=lambda name: -alike[name])
 
 
-def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
+def held_out_table(problem: Problem, run: ForwardPass) -> pd.DataFrame:
     """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
     if len(rows) == 0:
@@ -423,7 +424,7 @@ def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[wanted] = True
-    x, covariance = smoothed_covariance(problem, run, kept, engine)
+    x, covariance = smoothed_covariance(problem, run, kept)
     slots = problem.sources().slot
     out = []
     for row in rows.tolist():
@@ -465,9 +466,7 @@ def _chosen(problem: Problem) -> IntArray:
     return np.asarray(rows, dtype=np.int64)
 
 
-def smoothed_covariance(
-    problem: Problem, run: ForwardPass, kept: BoolArray, engine: str
-) -> tuple[FloatArray, FloatArray]:
+def smoothed_covariance(problem: Problem, run: ForwardPass, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
     rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
     rows[kept] = np.arange(int(kept.sum()))
@@ -486,7 +485,9 @@ def smoothed_covariance(
     # the smoother keeps the covariance of errors that the motion depends on: of all, where all are columns
     wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
     x = run.filtered.x_plus.copy()
-    backward(engine)(run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance)
+    _filter_kernels.rauch_tung_striebel(
+        run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance
+    )
     return x, unpacked(triangles)
 
 

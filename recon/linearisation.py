@@ -142,7 +142,7 @@ def converged(
             run = ekf.forward(thinned, reference, engine)
         else:
             run, reference = forward(thinned, reference)
-        smoothed = smoother.smooth(thinned, run, False, engine)
+        smoothed = smoother.smooth(thinned, run, with_covariance=False)
         judged = k or (forward is not None and reference is not None)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if judged else np.inf
         reference = bounded_drivers(thinned, smoothed.states(run.charts))

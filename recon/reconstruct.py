@@ -399,9 +399,9 @@ def reconstruct_once(
     checks += [] if phase is None else [phase.check()]
     checks += [] if sensors is None else [carried_check(spans)]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
-    held_out = held_out_table(problem, run, settings.engine)
+    held_out = held_out_table(problem, run)
     checks += consistency.held_out_checks(problem, held_out, settings)
-    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
+    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places)
     tracked = bool(trackers(telemetry, settings))
     checks += survey.place_checks(missed, settings.check_confidence, tracked)
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
@@ -620,7 +620,7 @@ def _iterate(
         problem = with_servo_lag(problem, reference)
         run, found = linearisation.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run, True, settings.engine)
+        smoothed = smoother.smooth(problem, run)
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         smoothed_states = smoothed.states(run.charts)

@@ -70,7 +70,6 @@ def missed_places(
     states: States,
     arm_body_m: FloatArray,
     places: tuple[KnownPlace, ...],
-    settings: Settings,
 ) -> list[Miss]:
     """By how much a trajectory misses places that are known.
 
@@ -91,7 +90,7 @@ def missed_places(
     nodes = nearest_index(problem.time_s, np.array([place.time_s for place in places]))
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[nodes] = True
-    _, covariances = smoothed_covariance(problem, run, kept, settings.engine)
+    _, covariances = smoothed_covariance(problem, run, kept)
     columns = {name: problem.model.column(SITES, name) for single in _HYPOTHESES[:4] for name in single}
     out = []
     for place, node in zip(places, nodes.tolist(), strict=True):
