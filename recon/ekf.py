@@ -146,9 +146,6 @@ class Innovations(NamedTuple):
     by_error: FloatArray
 
 
-_LEAST_NODES = 4  # of a path that servos follow
-
-
 @dataclass(frozen=True)
 class Problem:
     """Everything the filter needs.
@@ -265,7 +262,7 @@ class Problem:
 def with_servo_lag(problem: Problem, states: States | None) -> Problem:
     """Problem whose radars lag behind a path through all its nodes; as it is without servos, or a path."""
     lagging = [k for k, one in enumerate(problem.instruments) if one.kind == RADAR and one.servo_hz > 0.0]
-    if states is None or not lagging or len(problem.time_s) < _LEAST_NODES:
+    if states is None or not lagging or len(problem.time_s) < 4:
         return problem
     known, at_s = problem.observed.known.copy(), problem.time_s[problem.node]
     for number in lagging:

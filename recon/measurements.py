@@ -72,9 +72,6 @@ from recon.state import DRIVERS, ErrorModel, States, right_jacobian
 REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
-# the servo's lag is exact for an angle that runs straight between steps: the path's own steps are a tenth of a second
-_STEPS_A_PERIOD, _STEPS_S = 50, (0.01, 0.1)
-_SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
     POSITION: ("north", "east", "down"),
@@ -227,7 +224,7 @@ def radar_instrument(
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
-    known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
+    known = np.tile([3.2e-4, 0.0, 0.0], (len(sd), 1))  # n - 1 at a site near the sea
     place = earth.ecef_from_geodetic(*site.geodetic, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     made = instrument_of(
@@ -397,7 +394,8 @@ def servo_lag(instrument: Instrument, time_s: FloatArray, states: States, at_s: 
 
     c = rotations.dcm_from_q(states.q_ecef_body)
     point = CubicHermiteSpline(time_s, states.position_ecef_m + c @ instrument.arm_body_m, states.velocity_ecef_mps)
-    step_s = float(np.clip(1.0 / (_STEPS_A_PERIOD * instrument.servo_hz), *_STEPS_S))
+    # exact for an angle that runs straight between steps: the path's own are a tenth of a second
+    step_s = float(np.clip(1.0 / (50 * instrument.servo_hz), 0.01, 0.1))
     even_s, step_s = np.linspace(
         time_s[0], time_s[-1], 1 + int(np.ceil((time_s[-1] - time_s[0]) / step_s)), retstep=True
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import Any
 
 from flightmodel.checks import ConfigError, Fault, nearest_name
@@ -22,33 +23,26 @@ def _setting(default: object, allowed: str, convert: Callable[[Any], object], co
 
 
 def _as_number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
         raise TypeError
     return float(value)
 
 
 def _number(
-    default: float, low: float, high: float, also: float | None = None, below: bool = False, meaning: str = ""
+    default: float, low: float, high: float, also: float | None = None, below: bool = False, whole: bool = False
 ) -> Any:
-    """A number from ``low`` to ``high`` (``below`` it where asked), or ``also``, which means something special."""
+    """A number from ``low`` to ``high`` (``below`` it where asked), or ``also``, which means none."""
 
     def convert(value: Any) -> float:
         number = _as_number(value)
         if number != also and not (low <= number < high if below else low <= number <= high):
             raise ValueError
-        return number
-
-    end = " (1 excluded)" if below else ""
-    return _setting(default, (f"{also:g} ({meaning}) or " if meaning else "") + f"{low:g} to {high:g}{end}", convert)
-
-
-def _integer(default: int, low: int, high: int, also: int | None = None, meaning: str = "") -> Any:
-    def convert(value: Any) -> int:
-        if isinstance(value, bool) or int(value) != value or (value != also and not low <= value <= high):
+        if whole and number != int(number):
             raise ValueError
-        return int(value)
+        return int(number) if whole else number
 
-    return _setting(default, (f"{also} ({meaning}) or " if meaning else "") + f"{low} to {high}", convert)
+    none, end = "" if also is None else f"{also:g} (none) or ", " (1 excluded)" if below else ""
+    return _setting(default, f"{none}{low:g} to {high:g}{end}", convert)
 
 
 def _time() -> Any:
@@ -141,17 +135,17 @@ class Settings:
     """
 
     output_rate_hz: float = _number(20.0, 0.1, 1000.0)
-    pulse_rate_hz: float = _number(0.0, 0.1, 1000.0, also=0.0, meaning="none")
+    pulse_rate_hz: float = _number(0.0, 0.1, 1000.0, also=0.0)
     start_s: float | None = _time()
     end_s: float | None = _time()
     carry_on_s: float = _number(0.0, 0.0, 1e5)
-    passes: int = _integer(3, 0, 10)
+    passes: int = _number(3, 0, 10, whole=True)
     gate_probability: float = _number(0.9999, 0.5, 1.0, below=True)
     check_confidence: float = _number(0.999, 0.5, 1.0, below=True)
     angle_noise: str = _choice("traverse", ("traverse", "axis"))
     consider: tuple[str, ...] = _names()
     without: tuple[str, ...] = _names()
-    hold_out_every: int = _integer(0, 2, 1000, also=0, meaning="none")
+    hold_out_every: int = _number(0, 2, 1000, also=0, whole=True)
     hold_out_spans_s: tuple[tuple[float, float], ...] = _spans()
     attitude_sensors: bool = _flag(False)
     engine: str = _choice(COMPILED, ENGINES, _SYNONYMS)
@@ -163,7 +157,7 @@ class Settings:
             value, rule = getattr(self, setting.name), setting.metadata
             try:
                 object.__setattr__(self, setting.name, rule["convert"](value))
-            except (TypeError, ValueError) as wrong:
+            except (TypeError, ValueError, OverflowError) as wrong:
                 shown = f"'{value}'" if isinstance(value, str) else f"{value}"
                 hint = str(wrong) if rule["code"] == "setting-choice" else ""
                 faults.append(Fault(f"{setting.name} {shown}{hint} must be {rule['allowed']}", rule["code"]))

@@ -40,7 +40,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, IntArray
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray, IntArray
 from recon import _filter_kernels
 from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps, full_step, measured_rows
 from recon.state import KINEMATIC, States, boxplus, packed, unpacked
@@ -79,21 +79,37 @@ def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True) -> 
         Where readings are so far from the flight that what `two_filter` factors is no longer positive definite.
     """
     kept = int(problem.kept.sum()) if with_covariance else 0
-    triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
+    return _smoothed(problem, run.steps, run.filtered, run.innovations, kept)
+
+
+def smoothed_covariance(problem: Problem, run: ForwardPass, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
+    count = int(kept.sum())
+    rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
+    rows[kept] = np.arange(count)
+    phi = run.steps.transition
+    # covariance is kept of errors that the motion depends on: of all, where all are columns
+    wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
+    steps, filtered = run.steps._replace(transition=wide), run.filtered._replace(kept=rows)
+    made = _smoothed(problem, steps, filtered, run.innovations, count)
+    return made.x, unpacked(made.triangles)
+
+
+def _smoothed(problem: Problem, steps: Steps, filtered: Filtered, innovations: Innovations, kept: int) -> Smoothed:
+    """Smoothed errors, with moments of as many nodes as are ``kept``; of none where that is 0."""
+    dense = steps.transition.shape[2]
+    triangles, variance = np.empty((kept, dense * (dense + 1) // 2)), np.empty((kept, problem.size))
     considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
-    if len(considered):
-        x = run.filtered.x_minus.copy()
-        try:
-            two_filter(
-                run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
-                triangles, variance,
-            )  # fmt: skip
-        except np.linalg.LinAlgError:
-            words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
-            raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
-    else:
-        x = run.filtered.x_plus.copy()
-        _filter_kernels.rauch_tung_striebel(run.steps, run.filtered, problem.moving, x, triangles, variance)
+    if not len(considered):
+        x = filtered.x_plus.copy()
+        _filter_kernels.rauch_tung_striebel(steps, filtered, problem.moving, x, triangles, variance)
+        return Smoothed(x, triangles, variance)
+    x, slots = filtered.x_minus.copy(), problem.sources().slot
+    try:
+        two_filter(steps, filtered, problem.observed, slots, innovations, considered, x, triangles, variance)
+    except np.linalg.LinAlgError:
+        words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
+        raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
     return Smoothed(x, triangles, variance)
 
 

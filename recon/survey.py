@@ -27,10 +27,11 @@ from flightmodel.checks import FloatArray
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Finding, KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
-from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
+from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Problem
 from recon.measurements import SITES
 from recon.settings import Settings
+from recon.smoother import smoothed_covariance
 from recon.state import KINEMATIC, States
 
 _UNITS = {"m": ("m", 1.0), "rad": ("deg", float(np.rad2deg(1.0)))}
@@ -82,7 +83,6 @@ def missed_places(
         Accelerometer from the datum, which is what was at the places.
     places : tuple of KnownPlace
         A time outside the trajectory is compared with its nearer end, less well by the way flown in between.
-    settings : Settings
     """
     if not places:
         return []
