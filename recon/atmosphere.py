@@ -53,8 +53,8 @@ from flightmodel.vehicle import Vehicle
 from recon.consistency import data_sheet_check
 from recon.reconstruct import TrajectorySolution
 
-# a third of the winds' correlation length, a quarter of the trajectory's time
-_KNOT_M, _KNOT_S, _TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
+# a third of the winds' correlation length
+_KNOT_M, _TRAJECTORY_TIME_S = 1000.0, 20.0
 LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air measurably
 _LEAST_SAMPLES = 20  # windows: fewer say little of a profile
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
@@ -63,7 +63,6 @@ _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
 # log of the ratio of Mach numbers over which the error of C_A's shape forgets: about a flow regime, as the sources of
 # coefficients (ranges, tunnels, CFD) change from one to the next; assumed
 CA_SHAPE_LENGTH = float(np.log(2.0))
-_KNOT_LOG_MACH, _LEAST_MACH = 0.1, 0.1
 _BAD_DENSITY = (
     "is beyond the sounding's uncertainty: density, C_A, area or mass is wrong, which the drag does not separate; "
     "check the vehicle file and the sounding"
@@ -73,9 +72,6 @@ _BAD_DRAG = (
     "is beyond the pre-flight uncertainty: C_A, area, mass or density is wrong, which the drag does not separate; "
     "check the vehicle file and the sounding"
 )
-_LARGEST_RMS = 2.0
-_LEAST_STIFFNESS = 0.1  # share of the joint's stiffness that aerodynamic load leaves
-_CONVERGED_SD, _MOST_STEPS = 1e-2, 20  # far below any error; a bound
 # half the window over which sensors are averaged: well below the joint's period, well above the sampling interval
 HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
@@ -206,7 +202,7 @@ class _Model:
         mach = speed / air.sound_speed_mps
         body = lateral_angles(u)
         share = q / (self.largest_pa if largest_pa is None else largest_pa)
-        share = share / np.maximum(1.0 - growth * share, _LEAST_STIFFNESS)
+        share = share / np.maximum(1.0 - growth * share, 0.1)  # of its stiffness load leaves a joint a tenth at least
         tilt = share[:, None] * (gain[:, None] * body + x[:, 7:9]) + x[:, 9:11]
         flow, bend = body + tilt, gain * share
         # mean squares and product over the window: what turns in it has no mean, but keeps the axis' angle to the flow
@@ -296,8 +292,8 @@ def _prior(
 
     The flight's unknowns are in a priori standard deviations.
     """
-    log_mach = np.log(np.maximum(mach, _LEAST_MACH))
-    time, by_mach = _knots(samples.time_s, _KNOT_S), _knots(log_mach, _KNOT_LOG_MACH)
+    log_mach = np.log(np.maximum(mach, 0.1))
+    time, by_mach = _knots(samples.time_s, _TRAJECTORY_TIME_S / 4.0), _knots(log_mach, 0.1)
     one = np.ones((len(mach), 1))
     blocks = [_interpolation(samples.altitude_m, height)] * 3
     blocks += [sd * one for sd in (drag.ca_constant_sd, drag.cn_sd, *_FLEXURE_SD)]
@@ -342,7 +338,7 @@ def _least_squares(
     edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
     measured = model.samples.specific_force_body_mps2
     sd = np.hypot(_MODEL_FLOOR_MPS2, np.array([_AXIAL_PART, _LATERAL_PART, _LATERAL_PART]) * np.abs(measured[:, :1]))
-    for _ in range(_MOST_STEPS):
+    for _ in range(20):
         local = np.column_stack([b @ x[i:j] for b, i, j in zip(blocks, edges[:-1], edges[1:], strict=True)])
         force, partials = model.linearised(local)
         residual = (measured - force) / sd
@@ -360,7 +356,7 @@ def _least_squares(
         step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
         x = x + step
         covariance = cho_solve(factor, np.eye(len(x)))
-        if np.abs(step / np.sqrt(np.diag(covariance))).max() < _CONVERGED_SD:
+        if np.abs(step / np.sqrt(np.diag(covariance))).max() < 1e-2:  # far below any error
             break
     return x, covariance, residual
 
@@ -430,7 +426,7 @@ def _residual_checks(residual: FloatArray) -> list[Check]:
         rms = float(np.sqrt(np.mean(part**2)))
         out.append(
             Check.of(
-                "force-residuals", f"air residuals {name}", rms, 0.0, _LARGEST_RMS, "forces follow the model",
+                "force-residuals", f"air residuals {name}", rms, 0.0, 2.0, "forces follow the model",
                 "forces do not follow the model", advice="check coefficients, and for forces other than aerodynamic",
                 source="air", component=name,
             )

@@ -41,10 +41,10 @@ from flightmodel.checks import BoolArray, Check, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
 from recon._measurement_kernels import DECELERATION, RADAR
-from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem, jacobian
 from recon.measurements import REST, SLOT_NAMES
-from recon.settings import COMPILED, Settings
-from recon.smoother import Smoothed, backward, jacobian, two_filter
+from recon.settings import Settings
+from recon.smoother import Smoothed, smoothed_covariance
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
@@ -67,9 +67,7 @@ _BALLISTIC_CHECKS = {
 }
 _NAMED = 3  # failed checks in one sentence
 _MOST_OUTSIDE = 3.0  # sd beyond a physical range
-_ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
-_MOST_STRETCHES = 12  # of edited measurements that are listed one by one
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
 
 
@@ -357,10 +355,11 @@ def _look_alikes(problem: Problem, innovations: Innovations, number: int, compon
         size = np.linalg.norm(columns[:, k]) * np.linalg.norm(mine)
         if k not in biases and name != component and "survey" not in name and size > 0.0:
             alike[name] = abs(float(columns[:, k] @ mine)) / size
-    return sorted((name for name, c in alike.items() if c > _ALIKE), key=lambda name: -alike[name])
+    # from a quarter of the variance on a radar hardly separates two errors
+    return sorted((name for name, c in alike.items() if c > 0.5), key=lambda name: -alike[name])
 
 
-def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
+def held_out_table(problem: Problem, run: ForwardPass) -> pd.DataFrame:
     """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
     if len(rows) == 0:
@@ -369,7 +368,7 @@ def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[wanted] = True
-    x, covariance = smoothed_covariance(problem, run, kept, engine)
+    x, covariance = smoothed_covariance(problem, run, kept)
     slots = problem.sources().slot
     out = []
     for row in rows.tolist():
@@ -411,31 +410,6 @@ def _chosen(problem: Problem) -> IntArray:
     return np.asarray(rows, dtype=np.int64)
 
 
-def smoothed_covariance(
-    problem: Problem, run: ForwardPass, kept: BoolArray, engine: str
-) -> tuple[FloatArray, FloatArray]:
-    """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
-    rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
-    rows[kept] = np.arange(int(kept.sum()))
-    filtered = run.filtered._replace(kept=rows)
-    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
-    variance = np.empty((len(triangles), problem.size))
-    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
-    if len(considered):
-        x = run.filtered.x_minus.copy()
-        two_filter(
-            run.steps, filtered, problem.observed, problem.sources().slot, run.innovations, considered, x, triangles,
-            variance,
-        )  # fmt: skip
-        return x, unpacked(triangles)
-    phi = run.steps.transition
-    # the smoother keeps the covariance of errors that the motion depends on: of all, where all are columns
-    wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
-    x = run.filtered.x_plus.copy()
-    backward(engine)(run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance)
-    return x, unpacked(triangles)
-
-
 def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     """One row for each component that was measured; what is not ``used`` is held out."""
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
@@ -471,7 +445,7 @@ def edit_findings(problem: Problem, accepted: BoolArray) -> list[Issue]:
             continue
         what = "track point" if instrument.name == instrument.owner else "reading"
         stretches = np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1)
-        if len(stretches) > _MOST_STRETCHES:
+        if len(stretches) > 12:
             share = 100.0 * len(times) / int(mine.sum())
             remark = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
             out.append(Issue(remark, "points-edited", instrument.name, float(times[0]), float(times[-1])))

@@ -21,9 +21,7 @@ _LEAST_QUIET = 20  # readings: a second of them
 _MOST_FELT = 3.0  # beyond it the drag hides a bias that the check should show
 _CLEARLY_FELT = 50.0  # times its noise: steps of a twentieth are then clear
 _NEIGHBOURS = 5  # readings before and after a step: a quarter of a second at the rate of block means
-_GAP_STEPS = 2.5
 _OVERTURNING = 2.0 / 7.0  # (gamma - 1) / gamma of a gas of two atoms; carbon dioxide has 0.25
-_STRONG = 0.95  # quantile of readings that is a peak, beside wild ones
 
 
 def deceleration_checks(telemetry: Telemetry, problem: Problem, run: ForwardPass, confidence: float) -> list[Check]:
@@ -49,7 +47,7 @@ def lateral_checks(telemetry: Telemetry, confidence: float) -> list[Check]:
     spec = record.spec
     force = record.measured_sensor[np.isfinite(record.measured_sensor).all(axis=1)] @ spec.dcm_body_sensor.T
     axial = np.abs(force[:, 0])
-    strong = axial > 0.5 * np.quantile(axial, _STRONG)
+    strong = axial > 0.5 * np.quantile(axial, 0.95)  # which is a peak, beside wild readings
     mean = float(axial[strong].mean())
     if strong.sum() < _LEAST_QUIET or mean < _CLEARLY_FELT * max(spec.noise_sd, spec.bias_sd):
         return []
@@ -137,7 +135,7 @@ def reading_jump_checks(problem: Problem, run: ForwardPass, trim_sd_rad: float, 
         swing = np.sin(min(most * trim_sd_rad, 0.5 * np.pi)) ** 2 / most
         sd = np.sqrt((_OVERTURNING * np.diff(air)[k]) ** 2 + swing**2 + 2.0 * noise[k] ** 2 + scatter**2)
         gap = np.lib.stride_tricks.sliding_window_view(np.diff(time_s), 2 * _NEIGHBOURS - 1).max(axis=1)
-        whole = gap < _GAP_STEPS * np.median(np.diff(time_s))
+        whole = gap < 2.5 * np.median(np.diff(time_s))
         away = np.where(whole, jump / sd, 0.0)
         worst = int(np.argmax(away))
         when = f"from {time_s[k[worst]]:.2f} to {time_s[k[worst] + 1]:.2f} s"

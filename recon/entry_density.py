@@ -57,7 +57,6 @@ LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is gi
 _LEAST_FELT = 0.2
 _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
-_APART_S, _NOISE_SPAN_S = 2, 11  # a parachute inflates within a second or two; over a few seconds noise is the same
 _WAVES = 0.14  # of density over a kilometre or two: waves of 20 K in 140 K, assumed
 _SWING = 0.005  # of an axial force, while the vehicle swings by 4 deg; in level flight nothing else changes
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
@@ -375,9 +374,10 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     whole = rows.groupby(np.floor(table["time_s"]).astype(int)).agg(
         {"log_ratio": "mean", "height": "mean", "noise": "mean", "count": "sum"}
     )
-    noise = whole["noise"].rolling(_NOISE_SPAN_S, center=True, min_periods=1).mean() / whole["count"]
+    # over a few seconds noise is the same, and a parachute inflates within a second or two
+    noise = whole["noise"].rolling(11, center=True, min_periods=1).mean() / whole["count"]
     second = whole.index.to_numpy()
-    at = np.searchsorted(second, second - _APART_S, side="right") - 1
+    at = np.searchsorted(second, second - 2, side="right") - 1
     last = np.flatnonzero(at >= 0)
     if not len(last):
         return None

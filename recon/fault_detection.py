@@ -55,7 +55,6 @@ UNMODELLED_CODE = "unmodelled-acceleration"
 _REJECTED_S = 5.0  # no point accepted for so long in ballistic flight, or, in any, to the end of the track
 LEAST_REJECTED_POINTS = 6  # sound points are edited so seldom that six in a row have another cause
 _LEAST_ACCEPTED_SHARE = 0.5  # with fewer, the filter follows the minority
-_BEFORE_S, _AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
 _FIRST_DENSITY, _GROWTH, _LARGEST_DENSITY = 0.1, 10.0, 1.1e6  # (m/s^2)^2/Hz
 MOST_SPANS = 10  # in which inertial sensors may fail to carry the track before the flight is refused
 
@@ -179,7 +178,8 @@ def with_one_more(
     lost = _rejected_span(problem, run.innovations)
     if lost is None:
         return None
-    start, end = max(lost[0] - _BEFORE_S, float(problem.time_s[0])), lost[1] + _AFTER_S
+    # a slow departure passes the gate for a while
+    start, end = max(lost[0] - 1.5, float(problem.time_s[0])), lost[1] + 0.5
     near = [d for d in known if d.start_s <= end and start <= d.end_s]
     density = max((d.density for d in near), default=_FIRST_DENSITY / _GROWTH) * _GROWTH
     if density > _LARGEST_DENSITY:

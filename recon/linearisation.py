@@ -38,7 +38,6 @@ from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
 
 THINNED_STEP_S = 0.5  # one only linearises about that path
-_MOST_THINNED_PASSES = 6  # a bound: the passes with all points go on from there
 _FARTHEST_SD = 3.0  # where a pass overshoots, the next one corrects it from within the prior
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _FOLLOWED_RAD = 0.5  # sd of a phase whose 3 sd are a quarter of a turn, beyond which lateral force corrects it wrongly
@@ -135,13 +134,13 @@ def converged(
     From the filter's own estimate on, or from a reference. ``forward`` makes a pass about one and says about which, as
     `ekf.forward` does by itself; then one that the first pass does not move is the answer.
     """
-    for k in range(_MOST_THINNED_PASSES):
+    for k in range(6):  # the passes with all points go on from there
         thinned = with_servo_lag(thinned, reference)
         if forward is None:
             run = ekf.forward(thinned, reference, engine)
         else:
             run, reference = forward(thinned, reference)
-        smoothed = smoother.smooth(thinned, run, False, engine)
+        smoothed = smoother.smooth(thinned, run, with_covariance=False)
         judged = k or (forward is not None and reference is not None)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if judged else np.inf
         reference = bounded_drivers(thinned, smoothed.states(run.charts))

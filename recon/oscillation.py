@@ -59,8 +59,6 @@ _LEAST_EXPLAINED = 0.95  # share of the lateral force's square, by the best hypo
 # unequal inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.63, on 13 sound flights
 _LEAST_ROLL_RAD = np.deg2rad(2.0)
 _ROLL_SD = 4.0
-# speed of sound in thin air, 270 to 340: C_A and C_mq change slowly with Mach number; slower is no flight
-_SOUND_MPS, _DESCENT_MPS, _SLOWEST_MPS = 300.0, 100.0, 1.0
 # C_mq less the stated one, in its sd, among which it is looked for; dense where an unknown speed may make it small
 _DAMPING_SD = np.array([0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0])
 _DAMPING_SD = np.concatenate([-_DAMPING_SD[:0:-1], _DAMPING_SD])
@@ -227,9 +225,10 @@ def _damping_by_force(vehicle: Vehicle, speed: tuple[FloatArray, FloatArray] | N
 
     Without a speed that of a slow descent, where damping is largest, and anything between it and none.
     """
-    time_s, speed_mps = (np.zeros(1), np.full(1, _DESCENT_MPS)) if speed is None else speed
-    speed_mps = np.maximum(speed_mps, _SLOWEST_MPS)
-    ca, _, _, cmq = vehicle.aero.at(speed_mps / _SOUND_MPS, 0.0).T
+    time_s, speed_mps = (np.zeros(1), np.full(1, 100.0)) if speed is None else speed
+    speed_mps = np.maximum(speed_mps, 1.0)  # slower is no flight
+    # sound in thin air has 270 to 340 m/s: C_A and C_mq change slowly with Mach number
+    ca, _, _, cmq = vehicle.aero.at(speed_mps / 300.0, 0.0).T
     inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
     per_cmq = vehicle.mass_kg * vehicle.reference.length_m**2 / (2.0 * speed_mps * ca * inertia)
     sd = np.full(len(cmq), vehicle.uncertainty.cmq)

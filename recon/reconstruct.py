@@ -80,9 +80,7 @@ from recon.smoother import Smoothed
 from recon.state import KINEMATIC, States, unpacked
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
-_UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
-_CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
 _BLOCK = 1 << 16  # samples that are corrected at a time
 _NODES = 512  # whose covariances are unpacked at a time
 
@@ -399,9 +397,9 @@ def reconstruct_once(
     checks += [] if phase is None else [phase.check()]
     checks += [] if sensors is None else [carried_check(spans)]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
-    held_out = held_out_table(problem, run, settings.engine)
+    held_out = held_out_table(problem, run)
     checks += consistency.held_out_checks(problem, held_out, settings)
-    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
+    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places)
     tracked = bool(trackers(telemetry, settings))
     checks += survey.place_checks(missed, settings.check_confidence, tracked)
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
@@ -620,12 +618,12 @@ def _iterate(
         problem = with_servo_lag(problem, reference)
         run, found = linearisation.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run, True, settings.engine)
+        smoothed = smoother.smooth(problem, run)
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         smoothed_states = smoothed.states(run.charts)
         i += 1
-        if moved.max() < _CONVERGED_SD or i == most:
+        if moved.max() < 0.01 or i == most:
             return problem, run, smoothed, smoothed_states, i, found, phase
         reference = linearisation.bounded_drivers(problem, smoothed_states)
         del run, smoothed  # as large as all else together, and the next pass makes its own
@@ -649,7 +647,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         covariance = unpacked(triangles, KINEMATIC)
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
-        covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
+        covariance[:, range(6, 9), range(6, 9)] = np.pi**2 / 3.0  # angles that may be anything
         if any(i.kind == DECELERATION for i in problem.instruments):
             covariance[:, 3:6, 3:6] += turned_velocity_cov(states.velocity_ecef_mps, covariance[:, 3:6, 3:6])
         return Trajectory(

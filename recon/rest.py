@@ -31,7 +31,6 @@ from flightmodel.telemetry import AttitudePrior, RestReadings, Telemetry, TriadR
 from recon._measurement_kernels import FIELD, VELOCITY
 from recon.measurements import REST, Instrument, instrument_of
 
-_EVERY_S = 0.5  # of zero velocities: as first passes are thinned
 _LEVEL_SD_RAD = float(np.deg2rad(5.0))  # of the levelled prior, which zero velocities measure to a tenth of a degree
 _MOST_HEADING_RAD = float(np.deg2rad(30.0))  # beyond it linearisation fails
 _AGAIN = 3.0  # the Earth's rate is measured again in the filter: a ninth of its information counts twice
@@ -49,7 +48,7 @@ def rest_instruments(telemetry: Telemetry, start_s: float, point_ecef_m: FloatAr
     span = telemetry.start.at_rest
     if span is None or telemetry.rates is None:
         return ()
-    times = np.arange(max(span[0], start_s), span[1] + 1e-9, _EVERY_S)
+    times = np.arange(max(span[0], start_s), span[1] + 1e-9, 0.5)  # as first passes are thinned
     if not len(times):
         return ()
     latitude, longitude, _ = earth.geodetic_from_ecef(point_ecef_m)

@@ -27,10 +27,10 @@ from flightmodel.checks import Check, FloatArray, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
-from recon.consistency import smoothed_covariance
 from recon.ekf import ForwardPass, Problem
 from recon.measurements import SITES
 from recon.settings import Settings
+from recon.smoother import smoothed_covariance
 from recon.state import KINEMATIC, States
 
 _UNITS = {"m": ("m", 1.0), "rad": ("deg", float(np.rad2deg(1.0)))}
@@ -70,7 +70,6 @@ def missed_places(
     states: States,
     arm_body_m: FloatArray,
     places: tuple[KnownPlace, ...],
-    settings: Settings,
 ) -> list[Miss]:
     """By how much a trajectory misses places that are known.
 
@@ -83,7 +82,6 @@ def missed_places(
         Accelerometer from the datum, which is what was at the places.
     places : tuple of KnownPlace
         A time outside the trajectory is compared with its nearer end, less well by the way flown in between.
-    settings : Settings
     """
     if not places:
         return []
@@ -91,7 +89,7 @@ def missed_places(
     nodes = nearest_index(problem.time_s, np.array([place.time_s for place in places]))
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[nodes] = True
-    _, covariances = smoothed_covariance(problem, run, kept, settings.engine)
+    _, covariances = smoothed_covariance(problem, run, kept)
     columns = {name: problem.model.column(SITES, name) for single in _HYPOTHESES[:4] for name in single}
     out = []
     for place, node in zip(places, nodes.tolist(), strict=True):

@@ -40,7 +40,6 @@ from recon.state import KINEMATIC, States
 _WINDOW_S, _STEP_S = 4.0, 0.01  # some periods of the oscillation; a fortieth of one at 2.5 Hz
 _SMOOTH_S, SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
 _LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01  # a fifth of a period at 2.5 Hz: a longer one is found by `recon.oscillation`
-_LARGEST_SD_S = _LONGEST_LAG_S / 10.0  # else hardly any lag in the range would be significant
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square
 CORRELATION_S = 0.7  # of residuals
 _LEAST_WINDOWS = 4  # so that their scatter says how well the lag is known
@@ -88,7 +87,8 @@ def lag_between(
         both = (_lag_in_window(interpolate_rows(at, ft, f)[:, i], shifted, lags, i) for i in (1, 2))
         lags_found += [(*one, damping) for one in both if one is not None]
     lag = _combined(np.array(lags_found)) if len(lags_found) >= _LEAST_WINDOWS else None
-    return lag if lag is not None and lag.sd_s < _LARGEST_SD_S else None
+    # else hardly any lag in the range would be significant
+    return lag if lag is not None and lag.sd_s < _LONGEST_LAG_S / 10.0 else None
 
 
 def smoothed_body_axes(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:

@@ -30,7 +30,6 @@ from recon.state import States
 
 _STEP_S, _FARTHEST_S = 1.0, 10.0  # of a climb; the filter finds the way from as far
 _WIDE_S = 0.5  # a priori sd of what a shift leaves
-_NEAR_S, _MOST_STEPS = 0.02, 4  # the path's curvature over it is nothing
 _LEAST_GAIN = 1.0  # of log likelihood, that a step is taken
 _LEAST_LAG_S = 0.1  # below it the error state serves, with a wider prior
 _LARGE_S, _KNOWN_SD = 0.25, 5.0  # from here on third order counts; an estimate that is not its prior's
@@ -84,8 +83,8 @@ def _climbed(tried: Callable[[float], _Tried | None]) -> _Tried | None:
             if other is None or other.gain <= best.gain + _LEAST_GAIN:
                 break
             best = other
-    for _ in range(_MOST_STEPS):
-        if best is None or abs(best.rest_s) < _NEAR_S:
+    for _ in range(4):
+        if best is None or abs(best.rest_s) < 0.02:  # over which the path is straight
             break
         other = tried(best.late_s + best.rest_s)
         if other is None or other.gain < best.gain - _LEAST_GAIN:

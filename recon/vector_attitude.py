@@ -45,7 +45,6 @@ from recon.attitude_smoother import (
 )
 from recon.consistency import data_sheet_check
 
-_QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
 _START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude and rate follow within seconds
 _TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
@@ -234,7 +233,7 @@ def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Set
     step = np.diff(knots_s[solved])
     rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
     rate = float(np.median(rotated / step)) if len(step) else 0.0
-    longest = min(settings.longest_gap_s, _QUARTER_RAD / max(rate, 1e-9))
+    longest = min(settings.longest_gap_s, 0.5 * np.pi / max(rate, 1e-9))
     keep = np.zeros(len(knots_s), dtype=bool)
     keep[solved[0] : solved[-1] + 1] = True
     found = []
