@@ -639,7 +639,7 @@ def benchmark_deflection(frames: RelativeDeflections, loads: FlightLoads, prior_
     rows = np.flatnonzero(known)
     rows = rows[:: max(1, -(-len(rows) // MOST_FRAMES))]
     if len(rows) < LEAST_FRAMES:
-        raise GateError(f"{len(rows)} frames with sensor data where {LEAST_FRAMES} are needed", code="too-few-frames")
+        raise GateError(f"{len(rows)} frames with sensor data where {LEAST_FRAMES} are needed", code="too-few-data")
     times = np.append(frames.time_s[rows], frames.benchmark_s)
     whole = joint_moment(loads)
     moment = whole.at(loads.time_s, times)

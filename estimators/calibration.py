@@ -101,7 +101,7 @@ def read_corners(path: Path) -> pd.DataFrame:
     if missing:
         found = ", ".join(table.columns)
         hints = [f"no column '{c}'{nearest_name(c, list(table.columns))}; found {found}" for c in missing]
-        raise GateError([f"{label}: {path}: line 1: {hint}" for hint in hints], code="table-column-missing")
+        raise GateError([f"{label}: {path}: line 1: {hint}" for hint in hints], code="column-missing")
     faults: list[Issue] = []
     values = {c: tables.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
     for c, column in values.items():
@@ -154,7 +154,7 @@ def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens =
         raise GateError(
             f"calibration: OpenCV found no solution ({failed.err}); check that the board's columns are in metres, that "
             "corners are in the same order in every picture, and that the lens is the right kind",
-            code="calibration-failed",
+            code="not-converged",
         ) from failed
     distortion = np.asarray(found, dtype=float).ravel()
     residual, jacobian = _reprojected(boards, pixels, matrix, distortion, rotations, shifts, lens)
@@ -197,7 +197,7 @@ def _check_condition(jacobian: FloatArray) -> None:
             f"calibration: ill-conditioned: condition number above {_LARGEST_CONDITION:.0e}; take pictures in which "
             "the board is tilted to several sides and reaches the edges; check that each picture's corners lie "
             "where that picture has them",
-            code="calibration-ill-conditioned",
+            code="not-observable",
         )
 
 
@@ -206,9 +206,7 @@ def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[Issue]:
     missing = [c for c in COLUMNS if c not in corners.columns]
     if missing:
         listed = list(corners.columns)
-        return [
-            Issue(f"calibration: no column '{c}'{nearest_name(c, listed)}", "table-column-missing") for c in missing
-        ]
+        return [Issue(f"calibration: no column '{c}'{nearest_name(c, listed)}", "column-missing") for c in missing]
     out = []
     numbers = corners[list(COLUMNS[1:])].apply(pd.to_numeric, errors="coerce")
     bad = np.flatnonzero(~np.isfinite(numbers.to_numpy(dtype=float)).all(axis=1))
@@ -220,21 +218,21 @@ def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[Issue]:
         row = int(np.argmax(outside.to_numpy()))
         where = f"({numbers['u_px'].iloc[row]:g}, {numbers['v_px'].iloc[row]:g}) px"
         what = f"corner at {where} lies outside a picture of {size_px[0]} x {size_px[1]}; check the size"
-        out.append(Issue(f"calibration: line {row + 2}: {what}", "corner-outside-picture"))
+        out.append(Issue(f"calibration: line {row + 2}: {what}", "value-range"))
     far = numbers[["X_m", "Y_m"]].abs() > _LARGEST_BOARD_M
     if far.any(axis=None):
         row = int(np.argmax(far.any(axis=1).to_numpy()))
         where = f"({numbers['X_m'].iloc[row]:g}, {numbers['Y_m'].iloc[row]:g}) m"
         what = f"corner at {where} of the board; metres, below {_LARGEST_BOARD_M:g}"
-        out.append(Issue(f"calibration: line {row + 2}: {what}", "corner-off-board"))
+        out.append(Issue(f"calibration: line {row + 2}: {what}", "value-range"))
     counts = corners.groupby("image").size()
     if len(counts) < LEAST_PICTURES:
         what = f"calibration: {len(counts)} pictures; at least {LEAST_PICTURES}, better 20, are needed"
-        out.append(Issue(what, "too-few-pictures"))
+        out.append(Issue(what, "too-few-data"))
     few = counts[counts < _LEAST_CORNERS]
     if len(few):
         what = f"calibration: image {few.index[0]} has {few.iloc[0]} corners; at least {_LEAST_CORNERS} are needed"
-        out.append(Issue(what, "too-few-corners"))
+        out.append(Issue(what, "too-few-data"))
     return out
 
 

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
-_OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
+_OF_PICTURE = ("frame-exposure", "frame-size", "frame-undecodable", "frame-frozen")
 _NOT_THE_SHELL = (
     "camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge", "halves-differ",
     "shell-little-seen", "features-lost",
@@ -117,7 +117,7 @@ class FilmFit:
             Where a plane was assumed: only one component was read.
         """
         if self.plane_lv_rad is not None:
-            raise GateError("in an assumed plane only one component of the deflection is read", code="plane-assumed")
+            raise GateError("in an assumed plane only one component of the deflection is read", code="keys-conflict")
         rest = np.array([fit.per_benchmark for fit in self.fits])
         prior = self.oriented.apriori.benchmark_rad**2 * rest @ rest.transpose(0, 2, 1)
         covariance = np.array([fit.covariance for fit in self.fits]) - prior
@@ -307,7 +307,7 @@ def read_film(
     if benchmark is None:
         frames = list(frames)
         if len(frames) != len(times):
-            raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="frame-count")
+            raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="argument-value")
         benchmark = _read_frame(frames[nearest])
     benchmark_frame = edited(benchmark, edits, float(times[nearest]), fixed)
     oriented = orient_camera(benchmark_frame, geometry, camera_mount, joint_station_m, apriori, edits.pose)
@@ -324,7 +324,7 @@ def read_film(
         fits.append(oriented.fit(edited(picture, edits, t_s, fixed), axis, start))
         start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
-        raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
+        raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="argument-value")
     benchmark_s = float(times[nearest])
     fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
     if axis is not None and all(fit.refused for fit in fits) and oriented.edge_in_view < _EDGE_FOR_PLANE:
@@ -529,7 +529,7 @@ def _benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
         raise GateError(
             f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span {times_s[0]:.2f} to "
             f"{times_s[-1]:.2f} s",
-            code="benchmark-missing",
+            code="time-not-covered",
         )
     return nearest
 

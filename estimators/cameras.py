@@ -272,7 +272,7 @@ def best_clock(cameras: list[CameraReadings]) -> CameraReadings:
 def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[Pair]]:
     """Posterior of some cameras, and the tests of their agreement."""
     if not cameras:
-        raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-readings")
+        raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-data")
     evidence = [one.evidence(best_clock(cameras), wider) for one in cameras]
     known = np.sort(np.concatenate([one.time_s for one in evidence]))
     grid = np.arange(np.ceil(known.min() * _RATE_HZ), np.floor(known.max() * _RATE_HZ) + 1.0) / _RATE_HZ

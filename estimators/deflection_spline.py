@@ -341,7 +341,7 @@ def inverse_in_band(factor: FloatArray) -> csr_array:
 
 
 def _undetermined(method: str) -> DivergenceError:
-    return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
+    return DivergenceError(f"{method}: the readings do not determine the deflection", code="not-observable")
 
 
 def upper_band(matrix: csr_array) -> FloatArray:

@@ -151,7 +151,7 @@ def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Is
     if image.size == 0:
         return Issue("cannot be decoded", "frame-undecodable")
     if image.ndim != 2 or image.dtype != np.uint8:
-        return Issue(f"not an 8-bit grey image (shape {image.shape}, {image.dtype})", "frame-not-grey")
+        return Issue(f"not an 8-bit grey image (shape {image.shape}, {image.dtype})", "frame-size")
     if image.shape != (size_px[1], size_px[0]):
         size = f"size {image.shape[1]} x {image.shape[0]} where the camera has {size_px[0]} x {size_px[1]}"
         return Issue(size, "frame-size")
@@ -160,9 +160,9 @@ def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Is
     low, high = np.searchsorted(below, [0.05 * below[-1], 0.95 * below[-1]], side="right").tolist()
     saturated = float(np.mean(image[::4, ::4] >= 254))
     if high < 2.0 * _LEAST_CONTRAST:
-        return Issue(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-dark")
+        return Issue(f"too dark: 95 % of the pixels are no brighter than grey level {high} of 255", "frame-exposure")
     if low > 250 or saturated > 0.5:
-        return Issue("saturated: more than half of the pixels are at full scale", "frame-saturated")
+        return Issue("saturated: more than half of the pixels are at full scale", "frame-exposure")
     return _fault_of_fields(*kept.differences[:2])
 
 

@@ -126,7 +126,7 @@ class AeroTable:
             raise TableRangeError(
                 f"aerodynamic table: Mach {m.flat[bad]:.3f}, angle {np.rad2deg(a.flat[bad]):.2f} deg "
                 f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg",
-                code="aero-range",
+                code="table-range",
             )
         from scipy.interpolate import RegularGridInterpolator  # half a second to import
 
@@ -174,20 +174,20 @@ def check_axial_flow(path: Path, table: AeroTable) -> None:
         if abs(value) > AXIAL_TOLERANCE
     ]
     if faults:
-        raise GateError(faults[:MOST_FAULTS], code="aero-axial-flow")
+        raise GateError(faults[:MOST_FAULTS], code="aero-grid")
 
 
 def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Issue]:
     """Say what no row of a coefficient table may hold; ``row`` is finite, in the order of ``names``."""
     mach, alpha = row[:2]
     faults = (
-        [] if mach >= 0.0 else [Issue(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "aero-mach")]
+        [] if mach >= 0.0 else [Issue(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "value-range")]
     )
     if not 0.0 <= alpha <= 180.0:
-        faults.append(Issue(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "aero-angle"))
+        faults.append(Issue(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "value-range"))
     if alpha == 0.0:
         off = [k for k in (3, 4) if abs(row[k]) > AXIAL_TOLERANCE]
-        faults += [Issue(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-axial-flow") for k in off]
+        faults += [Issue(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-grid") for k in off]
     return faults
 
 
@@ -244,11 +244,11 @@ def _columns(path: Path, names: tuple[str, ...], head: tuple[int, str]) -> list[
         near = named_columns(names, header)
         meant = [f"'{near[c]}' looks like {c}: name it so" for c in missing if c in near]
         words = f"columns {', '.join(missing)} are missing; wanted {', '.join(names)}; found {', '.join(header)}"
-        raise GateError("; ".join([f"{path}: {words}", *meant]), code="aero-column-missing")
+        raise GateError("; ".join([f"{path}: {words}", *meant]), code="column-missing")
     twice = [c for c in names if header.count(c) > 1]
     if twice:
         words = f"columns {', '.join(twice)} stand twice; keep one of each"
-        raise GateError(f"{path}, line {head[0]}: {words}", code="column-twice")
+        raise GateError(f"{path}, line {head[0]}: {words}", code="given-twice")
     return header
 
 
@@ -339,14 +339,14 @@ def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> Aero
                 faults.append(
                     Issue(
                         f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}",
-                        "daveml-variable",
+                        "daveml-unsupported",
                     )
                 )
         elif match[0] not in functions:
             faults.append(
                 Issue(
                     f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)",
-                    "daveml-variable",
+                    "daveml-unsupported",
                 )
             )
         else:
@@ -369,7 +369,7 @@ def _parse(path: Path) -> ET.Element:
     def refuse(*_: Any) -> None:
         raise GateError(
             f"{path}: declares XML entities or its own document type; remove the DOCTYPE's [...] part",
-            code="daveml-doctype",
+            code="file-unreadable",
         )
 
     def doctype(_name: str, _system: str | None, _public: str | None, has_subset: int) -> None:
@@ -382,11 +382,11 @@ def _parse(path: Path) -> ET.Element:
         scout.Parse(data, True)
         root = ET.fromstring(data)
     except (expat.ExpatError, ET.ParseError) as fault:
-        raise GateError(f"{path}: not valid XML: {fault}", code="daveml-not-xml") from None
+        raise GateError(f"{path}: not valid XML: {fault}", code="file-unreadable") from None
     for element in root.iter():
         element.tag = str(element.tag).rsplit("}", 1)[-1]
     if root.tag != "DAVEfunc":
-        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc", code="daveml-not-xml")
+        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc", code="file-unreadable")
     return root
 
 
@@ -397,7 +397,7 @@ def _numbers(path: Path, element: ET.Element | None, where: str, faults: list[st
     except ValueError:
         values = np.array([])
     if len(values) == 0 or not np.isfinite(values).all():
-        faults.append(Issue(f"{path}: '{where}' holds no list of finite numbers", "daveml-numbers"))
+        faults.append(Issue(f"{path}: '{where}' holds no list of finite numbers", "file-unreadable"))
     return values
 
 
@@ -416,7 +416,7 @@ def _grid(
             faults.append(
                 Issue(
                     f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read",
-                    "daveml-input",
+                    "daveml-unsupported",
                 )
             )
     definition = function.find("functionDefn")
@@ -428,24 +428,26 @@ def _grid(
         faults.append(
             Issue(
                 f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read",
-                "daveml-ungridded",
+                "daveml-unsupported",
             )
         )
         return None
     units = table.get("units") or (variables[output].get("units") or "")
     if units not in NO_UNITS:
-        faults.append(Issue(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unit"))
+        faults.append(
+            Issue(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unsupported")
+        )
     grids = []
     for reference, name, axis in zip(table.findall("breakpointRefs/bpRef"), inputs, axes, strict=False):
         knots = points.get(reference.get("bpID", ""), np.array([]))
         unit = (variables[name].get("units") or "") if name in variables else ""
         if axis == "alpha" and unit not in ANGLE_UNITS:
-            faults.append(Issue(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unit"))
+            faults.append(Issue(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unsupported"))
         if len(knots) < 2 or (np.diff(knots) <= 0).any():
             faults.append(
                 Issue(
                     f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined",
-                    "daveml-breakpoints",
+                    "file-unreadable",
                 )
             )
         grids.append(knots * ANGLE_UNITS.get(unit, 1.0) if axis == "alpha" else knots)
@@ -454,7 +456,7 @@ def _grid(
         faults.append(
             Issue(
                 f"{path}: '{output}' has {values.size} values where its breakpoints want another number",
-                "daveml-breakpoints",
+                "file-unreadable",
             )
         )
     return None if len(faults) > before else (axes, grids, values.reshape([len(g) for g in grids]))
@@ -654,7 +656,7 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
         sidecar = read_section(Sidecar, beside)
     except ConfigError as fault:
         wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
-        faults += fault.faults if beside.exists() else [Issue(f"{beside}: no such file{wanted}", "sidecar-missing")]
+        faults += fault.faults if beside.exists() else [Issue(f"{beside}: no such file{wanted}", "file-missing")]
     wind = sidecar is not None and sidecar.axes == "wind"
     names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
     try:

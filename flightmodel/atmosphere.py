@@ -121,7 +121,7 @@ def _in_range(name: str, altitude_m: FloatArray | float, lowest_m: float) -> Flo
     z = np.asarray(altitude_m, dtype=float)
     if not ((z >= lowest_m) & (z <= TOP_M)).all():
         words = f"altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {lowest_m:.0f} to {TOP_M:.0f} m"
-        raise GateError(f"{name}: {words}", code="altitude-range")
+        raise GateError(f"{name}: {words}", code="value-range")
     return z
 
 
@@ -549,13 +549,13 @@ def nrlmsis_of(t0_utc: str, latitude_rad: float, longitude_rad: float, f107: flo
     Raises
     ------
     ConfigError
-        ``nrlmsis-missing`` without the library.
+        ``package-missing`` without the library.
     """
     try:
         import pymsis
     except ImportError:
         words = "NRLMSIS needs pymsis: pip install 'postflight[msis]', or choose base = \"us76\""
-        raise ConfigError(words, code="nrlmsis-missing") from None
+        raise ConfigError(words, code="package-missing") from None
     z = np.concatenate([np.arange(0.0, 130e3, 1000.0), np.arange(130e3, 200e3, 2000.0), np.arange(200e3, 4.01e5, 1e4)])
     time = np.datetime64(parse_utc(t0_utc).replace(tzinfo=None))
     east, north = np.rad2deg([longitude_rad, latitude_rad])

@@ -189,7 +189,7 @@ def check_path(name: str, value: str | Path) -> Path:
 def check_whole(name: str, value: int | None, low: int) -> None:
     """Raise `ConfigError` where an argument of the public interface is no whole number from ``low``; None is none."""
     if value is not None and (isinstance(value, bool) or not isinstance(value, Integral) or value < low):
-        raise ConfigError(f"{name} = {value!r}: a whole number from {low} is wanted", code="option-value")
+        raise ConfigError(f"{name} = {value!r}: a whole number from {low} is wanted", code="value-range")
 
 
 def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> FloatArray:
@@ -200,7 +200,7 @@ def check_shape(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> 
     out = np.ascontiguousarray(array, dtype=np.float64)
     fits = out.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, out.shape, strict=True))
     if not fits:
-        raise GateError(f"{name}: shape {out.shape} where {shape} is wanted", code="array-shape")
+        raise GateError(f"{name}: shape {out.shape} where {shape} is wanted", code="argument-value")
     return out
 
 
@@ -221,7 +221,7 @@ def check_increasing(name: str, time_s: FloatArray) -> None:
         k = int(np.argmax(step <= 0))
         raise GateError(
             f"{name}: time does not increase at index {k + 1}: {time_s[k]:.6f} s then {time_s[k + 1]:.6f} s",
-            code="not-increasing",
+            code="argument-value",
         )
 
 
@@ -229,9 +229,7 @@ def check_unit_quaternion(name: str, q: FloatArray) -> None:
     """Raise `GateError` where a quaternion's norm differs from one by more than a millionth."""
     off = np.abs(np.linalg.norm(q, axis=-1) - 1.0)
     if (off > 1e-6).any():
-        raise GateError(
-            f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})", code="not-unit-quaternion"
-        )
+        raise GateError(f"{name}: not a unit quaternion (norm off by {float(off.max()):.2e})", code="argument-value")
 
 
 def check_positive_definite(name: str, matrix: FloatArray) -> None:
@@ -239,5 +237,5 @@ def check_positive_definite(name: str, matrix: FloatArray) -> None:
     lowest = float(np.linalg.eigvalsh(matrix).min())
     if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0) or lowest <= 0.0:
         raise GateError(
-            f"{name}: not symmetric positive definite (lowest eigenvalue {lowest:.3g})", code="not-positive-definite"
+            f"{name}: not symmetric positive definite (lowest eigenvalue {lowest:.3g})", code="argument-value"
         )

@@ -147,7 +147,7 @@ SectionT = TypeVar("SectionT", bound=Section)
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file, or raise `ConfigError` with the file, line and column."""
     if "\0" in str(path):
-        raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-nul")
+        raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-refused")
     try:
         return tomllib.loads(file_bytes(path, LARGEST_TOML_BYTES).decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
@@ -211,7 +211,7 @@ def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Issue]:
     """Faults that one item of pydantic's list means."""
     path = [str(part) for part in item["loc"]]
     if path and path[-1] == "[key]":
-        return [Issue(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
+        return [Issue(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "option-format")]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])

@@ -104,7 +104,7 @@ class StateEntry(Section):
             unit = matrix / np.outer(scale, scale)
             if (variance <= 0.0).any() or not np.allclose(unit, unit.T, atol=1e-6) \
                     or np.linalg.eigvalsh(0.5 * (unit + unit.T))[0] < -1e-6:  # fmt: skip
-                words = Issue("a covariance is symmetric with positive eigenvalues", "covariance-impossible")
+                words = Issue("a covariance is symmetric with positive eigenvalues", "argument-value")
                 yield "covariance", "...", words
 
     def prior(self, t0_utc: str, planet: earth.Planet) -> StatePrior:
@@ -127,7 +127,7 @@ class StateEntry(Section):
                 f"its height above {name}'s ellipsoid is {height / 1000.0:.0f} km: radius_m is from {name}'s centre, "
                 "altitude_m from the ellipsoid, in metres; of an altitude above a sphere state radius_m, the sum"
             )
-            raise GateError(words, "state-height")
+            raise GateError(words, "value-range")
         step = 0.1 * np.sqrt(np.diagonal(covariance))
         moved = [
             self._fixed(stated + h, t0_utc, planet) - self._fixed(stated - h, t0_utc, planet) for h in np.diag(step)
@@ -208,7 +208,7 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
         gate.refuse_rows(table, "c_a", 1e-6, 10.0, "no axial force coefficient")
         mach, c_a = table.columns["mach"], table.columns["c_a"]
         if len(gate.faults) == before and not (np.isfinite(mach + c_a).all() and (np.diff(mach) > 0.0).all()):
-            gate.refuse(f"drag.table: {table.path}: Mach numbers grow from row to row, without gaps", "mach-order")
+            gate.refuse(f"drag.table: {table.path}: Mach numbers grow from row to row, without gaps", "time-backwards")
         if len(gate.faults) > before:
             return None
     fast = (mach >= _SUPERSONIC) | (len(mach) == 1)
@@ -235,7 +235,7 @@ def refuse_misread_entry(gate: Gate, record: TriadRecord, state: StatePrior) -> 
         gate.refuse(
             f"{name}: readings from {record.time_s[0]:.6g} to {record.time_s[-1]:.6g} s, the state is of "
             f"{state.time_s:.6g} s: all times count from t0_utc; state offset_s of a spacecraft's clock, or its unit",
-            "times-apart",
+            "time-not-covered",
         )
     axial = record.spec.dcm_body_sensor[0]
     used = np.abs(axial) > 1e-9

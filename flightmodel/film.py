@@ -234,12 +234,12 @@ def start_fault(path: Path) -> Issue:
     if fault := unfit(path, sys.maxsize):  # it is decoded frame by frame
         return fault
     if path.stat().st_size == 0:
-        return Issue("is empty", "file-empty")
+        return Issue("is empty", "file-unreadable")
     with path.open("rb") as file:
         start = file.read(12)
     # by content: a list of other places to play from would be opened too
     if not (start[:4] == WEBM_START or start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")):
-        return Issue(UNKNOWN_FILM, "film-unreadable")
+        return Issue(UNKNOWN_FILM, "file-unreadable")
     return NO_FAULT
 
 
@@ -251,16 +251,16 @@ def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
     try:
         if not film.isOpened():
             return Issue(
-                f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)", "film-unreadable"
+                f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)", "file-unreadable"
             )
         width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != size_px:
-            return Issue(f"is {width} x {height} pixels, the camera {size_px[0]} x {size_px[1]}", "image-size")
+            return Issue(f"is {width} x {height} pixels, the camera {size_px[0]} x {size_px[1]}", "frame-size")
         count = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
         if 0 < count <= last_number:
             return Issue(f"has {count} frames; the list asks for frame {last_number} (the first is 0)", "frame-missing")
         if not film.grab():
-            return Issue("holds no frame that can be decoded", "film-unreadable")
+            return Issue("holds no frame that can be decoded", "file-unreadable")
     finally:
         film.release()
     return ""
@@ -279,16 +279,16 @@ def image_fault(path: Path, size_px: tuple[int, int]) -> str:
             with PIL.Image.open(path, formats=PICTURE_KINDS) as head:
                 size = head.size
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
-        return Issue(f"has far more pixels than the camera's {size_px[0]} x {size_px[1]}", "image-size")
+        return Issue(f"has far more pixels than the camera's {size_px[0]} x {size_px[1]}", "frame-size")
     except (OSError, ValueError, SyntaxError):
-        return Issue(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "image-unreadable")
+        return Issue(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "file-unreadable")
     if sorted(size) == sorted(size_px) and not _is_whole_png(path):  # a rotated JPEG has that in its metadata
         height, width = read_image(path).shape
         if height == 0:
-            return Issue("cannot be decoded as an image", "image-unreadable")
+            return Issue("cannot be decoded as an image", "file-unreadable")
         size = (width, height)
     if size != size_px:
-        return Issue(f"is {size[0]} x {size[1]} pixels, the camera {size_px[0]} x {size_px[1]}", "image-size")
+        return Issue(f"is {size[0]} x {size[1]} pixels, the camera {size_px[0]} x {size_px[1]}", "frame-size")
     return ""
 
 

@@ -298,7 +298,7 @@ class FlightFile(Section):
         yield from self._misfits_of_planet()
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
-            yield Issue(words, "drag-twice")
+            yield Issue(words, "keys-conflict")
         if needs_path or self.radars or self.gnss or not self.films:
             yield from self._misfits_of_path()
         if self.films and self.vehicle is None:
@@ -306,13 +306,13 @@ class FlightFile(Section):
             yield Issue(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
-            yield Issue(words, "frames-twice")
+            yield Issue(words, "keys-conflict")
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
             if name in _TAKEN:
                 words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
-            yield Issue(words, "name-twice")
+            yield Issue(words, "given-twice")
 
     def _misfits_of_planet(self) -> Iterator[Issue]:
         """Yield what is known of the Earth alone."""
@@ -320,18 +320,18 @@ class FlightFile(Section):
             return
         where = f'planet = "{self.planet}"'
         if self.sensors.magnetometer is not None:
-            yield Issue(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown")
+            yield Issue(f"[sensors.magnetometer]: {where} has no field model; take it out", "planet-unsupported")
         if self.sensors.sun is not None:
             words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
-            yield Issue(f"[sensors.sun]: {where}: {words}", "sun-unknown")
+            yield Issue(f"[sensors.sun]: {where}: {words}", "planet-unsupported")
         for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
             for name, entry in entries.items():
                 if entry.height_is == "msl" and entry.geoid_undulation_m is None:
                     words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
-                    yield Issue(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown")
+                    yield Issue(f"{table}.{name}: {where} has no geoid here; {words}", "planet-unsupported")
         if self.start.at_rest is not None:
             words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
-            yield Issue(f"start.at_rest: {where}: {words}", "rest-unknown")
+            yield Issue(f"start.at_rest: {where}: {words}", "planet-unsupported")
 
     def _misfits_of_drag(self) -> Iterator[Issue]:
         """Yield what ballistic flight and an accelerometer without gyros lack."""
@@ -346,7 +346,7 @@ class FlightFile(Section):
                 words = (
                     f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
                 )
-                yield Issue(f"sensors.accelerometer: {words}", "axial-missing")
+                yield Issue(f"sensors.accelerometer: {words}", "input-missing")
         elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
             words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
             yield Issue(f"sensors.accelerometer.{words}", "inertial-missing")
@@ -375,7 +375,7 @@ class FlightFile(Section):
         attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
         if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
             words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
-            yield Issue(f"{words}; take [start] out", "rest-without-inertial")
+            yield Issue(f"{words}; take [start] out", "keys-conflict")
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
             words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
@@ -387,7 +387,7 @@ def read_flight_file(folder: Path) -> FlightFile:
     path = folder / "flight.toml"
     if not folder.is_dir():
         words = f"is a file; its folder is wanted: {folder.parent}" if folder.is_file() else "no such flight folder"
-        raise ConfigError(f"{folder}: {words}", code="folder-missing")
+        raise ConfigError(f"{folder}: {words}", code="file-missing")
     return read_section(FlightFile, path)
 
 
@@ -520,7 +520,8 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         kinds = (("radars", found.radars), ("receivers", found.gnss), ("start", found.state))
         trackers = " and ".join(kind for kind, some in kinds if some)
         raise GateError(
-            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)", code="no-common-time"
+            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)",
+            code="time-not-covered",
         )
     return telemetry
 
@@ -548,17 +549,17 @@ def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
     try:
         path = vehicle_path(name, gate.folder)
         if gate.is_truth(path):
-            raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-in-truth")
+            raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-refused")
         vehicle = vehicle_from_toml(path).with_events((event.name, event.t_s) for event in events)
     except GateError as fault:
         for each in fault.faults:
             gate.refuse_config(Issue(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
-        use, code = "the camera's fit is of its edge and surface", "mesh-fitted"
+        use, code = "the camera's fit is of its edge and surface", "mesh-use"
         if body == "centerbody":
-            use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-drawn"
-        code = "mesh-apart" if mesh.apart else code
+            use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-use"
+        code = "mesh-use" if mesh.apart else code
         gate.findings.append(Issue(f"{mesh.words}; {use}", code, f"mesh of the {body}"))
     return vehicle
 
@@ -595,7 +596,7 @@ def _attitude_prior(gate: Gate, entry: AttitudeEntry, place: tuple[float, float]
         q = np.array(entry.q_ecef_body)
         norm = float(np.linalg.norm(q))
         if abs(norm - 1.0) > 1e-3:
-            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "quaternion-norm")
+            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "value-range")
             return None
         return AttitudePrior(entry.t_s, q / norm, sd)
     if entry.latitude_deg is not None and entry.longitude_deg is not None:

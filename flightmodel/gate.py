@@ -107,12 +107,12 @@ class Gate:
     def wrong_place(self, path: Path, named: str) -> str:
         """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
         if "\0" in named:
-            return Issue(f"file {named!r}: a path holds no NUL character", "path-nul")
+            return Issue(f"file {named!r}: a path holds no NUL character", "path-refused")
         if Path(named).is_absolute() or not path.resolve().is_relative_to(self.folder.resolve()):
             words = f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
-            return Issue(words, "path-outside-folder")
+            return Issue(words, "path-refused")
         if self.is_truth(path):
-            return Issue(f"file '{named}' lies in truth/, which no estimator may open", "path-in-truth")
+            return Issue(f"file '{named}' lies in truth/, which no estimator may open", "path-refused")
         return ""
 
     def is_truth(self, path: Path) -> bool:
@@ -148,7 +148,7 @@ class Gate:
         shorts = [q.short for q in quantities]
         for key in (k for k in source.columns if k not in shorts):
             hint = nearest_name(key, shorts)
-            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}", "quantity-unknown")
+            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}", "name-unknown")
         path = self.path(source.file)
         if path is None:
             return None
@@ -225,7 +225,7 @@ class Gate:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
             self.refuse(
                 f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed",
-                "use-span-empty",
+                "too-few-rows",
             )
         return table.of_rows(rows)
 
@@ -424,10 +424,10 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
         return Delivery(everything, refusal=_refusal_of_clock(time_s, lines, row, contradicting))
     late = np.setdiff1d(late, squeezed)
     repairs = (
-        (again, "repeat earlier rows: left out", "rows-repeated"),
+        (again, "repeat earlier rows: left out", "rows-left-out"),
         (late, "came late or out of order: put in order", "rows-reordered"),
         (torn, f"give different values for one time ({_times(time_s, torn)}): none of them is used", "rows-contradict"),
-        (squeezed, "came late where earlier rows leave no room: not used", "rows-no-room"),
+        (squeezed, "came late where earlier rows leave no room: not used", "rows-contradict"),
     )
     findings = tuple(
         Issue(f"{_blocks(k)} {words}", code, "", float(time_s[k].min()), float(time_s[k].max()))
@@ -519,7 +519,7 @@ def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArra
         return Issue(f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}", "rows-contradict")
     if len(squeezed):
         words = f"where earlier rows leave no room ({len(squeezed)} such rows in all)"
-        return Issue(f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}", "rows-no-room")
+        return Issue(f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}", "rows-contradict")
     words = (
         f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
     )
@@ -551,14 +551,14 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
     if not use.all():
         again = time_s[~use]
         words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats asks"
-        findings.append(Issue(words, "rows-repeated", name, float(again[0]), float(again[-1])))
+        findings.append(Issue(words, "rows-left-out", name, float(again[0]), float(again[-1])))
     if source.use_s is not None:
         inside = np.any([(time_s >= start) & (time_s <= stop) for start, stop in source.use_s], axis=0)
         left = int((use & ~inside).sum())
         if left:
             spans = ", ".join(f"{start:g} to {stop:g} s" for start, stop in source.use_s)
             words = f"{left} of {int(use.sum())} rows lie outside use_s ({spans}) and are left out"
-            findings.append(Issue(words, "rows-outside-span", name))
+            findings.append(Issue(words, "rows-left-out", name))
         use &= inside
     return use, findings
 
@@ -574,4 +574,4 @@ def oversampled(
     rows = str(counts.pop()) if len(counts) == 1 else ", ".join(f"{count} ({c})" for c, count in idle.items() if count)
     spacings = "; ".join(sorted({f"{s.every_s:g} s" for s in thinning if s.every_s > 0.0}))
     words = f"{rows} of {len(time_s)} rows lie closer than every_s = {spacings}: they are predicted and not used"
-    return [Issue(words, "rows-oversampled", name)]
+    return [Issue(words, "samples-averaged", name)]

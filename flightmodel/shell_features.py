@@ -73,9 +73,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
                 row = int(np.argmin(good))
                 where = f"{label}: {path}: line {line_of(frame, row)}, column '{column}'"
                 count = int((~good).sum())
-                faults.append(
-                    Issue(f"{where}: {frame[column].iloc[row]}: {wanted} ({count} in all)", "feature-off-shell")
-                )
+                faults.append(Issue(f"{where}: {frame[column].iloc[row]}: {wanted} ({count} in all)", "edit-unusable"))
     if faults:
         raise GateError(faults)
     at = np.deg2rad(clock)
@@ -92,7 +90,7 @@ def _words(
     if strange.any():
         row = int(np.argmax(strange))
         words = f"geometry.features: {path}: line {line_of(frame, row)}, column '{column}': '{cells.iloc[row]}'"
-        faults.append(Issue(f"{words}: {' or '.join(known)} is wanted ({int(strange.sum())} in all)", "feature-word"))
+        faults.append(Issue(f"{words}: {' or '.join(known)} is wanted ({int(strange.sum())} in all)", "not-a-number"))
         return np.zeros(len(cells), dtype=np.int64)
     return cells.map({word: k for k, word in enumerate(known)}).to_numpy(dtype=np.int64)
 

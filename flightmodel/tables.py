@@ -357,9 +357,9 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     except UnfitFile as fault:
         raise GateError(f"{label}: {path}: {fault.strerror}", fault.code) from None
     except (UnicodeDecodeError, OSError) as fault:
-        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="table-unreadable") from None
+        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="file-unreadable") from None
     if "\0" in text:
-        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="table-unreadable")
+        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="file-unreadable")
     numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if len(numbered) <= least_rows:
         rows = max(0, len(numbered) - 1)
@@ -370,11 +370,11 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     opened = _open_quote(numbered)
     if opened:
         raise GateError(
-            f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it", code="table-quote"
+            f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it", code="row-ragged"
         )
     names, counts = _cells(numbered)
     head = f"{label}: {path}: line {numbered[0][0]}"
-    faults = [Issue(f"{head}: column '{n}' stands twice", "column-twice") for n in _twice(names)]
+    faults = [Issue(f"{head}: column '{n}' stands twice", "given-twice") for n in _twice(names)]
     ragged = np.flatnonzero(counts != len(names))
     if len(ragged):
         k = int(ragged[0])
@@ -521,7 +521,7 @@ def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, la
     else:
         hint = nearest_name(column, frame.columns)
     words = f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
-    return Issue(words, "table-column-missing")
+    return Issue(words, "column-missing")
 
 
 def unordered_times_s(
@@ -533,7 +533,7 @@ def unordered_times_s(
         found = ", ".join(frame.columns)
         hint = nearest_name(absent[0], frame.columns)
         faults.append(
-            Issue(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "table-column-missing")
+            Issue(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "column-missing")
         )
         return None
     if spec.format == "seconds":
@@ -548,7 +548,7 @@ def unordered_times_s(
         cell = ":".join(frame[column].iloc[first].strip() for column in spec.parts)
         where = f"{label}: {path}: line {line_of(frame, first)}: time '{cell}'"
         if _SECOND_60.search(cell):
-            faults.append(Issue(f"{where} {SECOND_60}", "second-60"))
+            faults.append(Issue(f"{where} {SECOND_60}", "time-format"))
         else:
             faults.append(Issue(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
         return None

@@ -402,14 +402,14 @@ class Vehicle:
         Raises
         ------
         ConfigError
-            ``event-unknown``: a step names an event that is not among ``events``.
+            ``name-unknown``: a step names an event that is not among ``events``.
         """
         times, faults, steps = dict(events), list[Issue](), list[MassStep]()
         for step in self.mass_steps:
             if step.event is not None and step.event not in times:
                 hint = f"{nearest_name(step.event, list(times))}; known: {', '.join(times) or 'none'}"
                 words = f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}"
-                faults.append(Issue(words, "event-unknown"))
+                faults.append(Issue(words, "name-unknown"))
             else:
                 at_s = step.from_s if step.event is None else times[step.event]
                 steps.append(step.model_copy(update={"from_s": at_s, "event": None}))
@@ -475,7 +475,7 @@ class Vehicle:
 
 def vehicle_path(name: str, beside: Path | None = None) -> Path:
     """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
-    return path_of("vehicle", name, "vehicle-unknown", beside)
+    return path_of("vehicle", name, "name-unknown", beside)
 
 
 def shipped(kind: str) -> list[str]:
@@ -486,7 +486,7 @@ def shipped(kind: str) -> list[str]:
 def path_of(kind: str, name: str, code: str, beside: Path | None = None) -> Path:
     """Find a file of a kind (vehicle, scenario): its path, or the name of a shipped one; refuse others with a code."""
     if "\0" in name:
-        raise ConfigError(f"{kind} {name!r}: a path holds no NUL character", code="path-nul")
+        raise ConfigError(f"{kind} {name!r}: a path holds no NUL character", code="path-refused")
     if name.endswith(".toml"):
         return (beside or Path()) / name
     if name not in shipped(kind):
@@ -530,11 +530,11 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     beside = [*listed, *drawn, *((table, str(Path(table).with_suffix(".toml"))) if table is not None else ())]
     if out := [name for name in beside if leads_outside(path.parent, name)]:
         words = "leads out of the vehicle file's folder; copy the file there"
-        raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-outside-folder")
+        raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-refused")
     own = table is not None and (path.parent / table).exists()
     if own and table is not None and (path.parent / table).with_suffix(".toml").resolve() == path.resolve():
         words = f"key 'aerodynamics.table' = '{table}': its sidecar would be this vehicle file; rename the table"
-        raise ConfigError(f"{path}: {words}", code="sidecar-is-vehicle")
+        raise ConfigError(f"{path}: {words}", code="keys-conflict")
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)

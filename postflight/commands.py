@@ -325,9 +325,9 @@ def asked(
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and name):
-            faults.append(Issue(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+            faults.append(Issue(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "option-format"))
         elif name in changes:
-            faults.append(Issue(f"--set {text}: {name} is set twice; give it once", "set-twice"))
+            faults.append(Issue(f"--set {text}: {name} is set twice; give it once", "given-twice"))
         else:
             changes[name] = _toml_value(value)
     if faults:
@@ -512,7 +512,7 @@ def deflection(
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     elif film:
         console.coded(
-            "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "film-not-drawn"
+            "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "figure-failed"
         )
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:

@@ -170,7 +170,7 @@ def compare_runs(runs: tuple[RunTables, ...]) -> RunComparison:
     Raises
     ------
     ConfigError
-        ``compare-runs`` for fewer than two or too many runs, ``compare-same-run`` where one comes twice.
+        ``compare-runs`` for fewer than two or too many runs, ``given-twice`` where one comes twice.
     """
     if not 2 <= len(runs) <= MOST_RUNS:
         words = f"compare: {len(runs)} run{'s' * (len(runs) != 1)} named; 2 to {MOST_RUNS} are wanted"
@@ -179,7 +179,7 @@ def compare_runs(runs: tuple[RunTables, ...]) -> RunComparison:
     again = sorted({place.name for k, place in enumerate(places) if place in places[:k]})
     if again:
         words = f"compare: {', '.join(again)} is named more than once; name another run, such as FOLDER/plain"
-        raise ConfigError(words, "compare-same-run")
+        raise ConfigError(words, "given-twice")
     return RunComparison(runs, _labels(runs))
 
 
@@ -243,7 +243,7 @@ def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
     a, b = first.tables["bet"], other.tables["bet"]
     rows = a["t_s"].between(b["t_s"].iloc[0], b["t_s"].iloc[-1])
     if rows.sum() < 2:
-        raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "no-common-time")
+        raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "time-not-covered")
     t = a["t_s"][rows].to_numpy(float)
     out = {"t_s": t, "run": ""} | _vectors(a[rows], b)
     for q in TRAJECTORY:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # estimators are a quarter of a second to import, for command
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
-NO_COMMON_ANSWER = ("inputs-far-off", "fusion-not-converged", "camera-time-bias", "deflection-undetermined")
+NO_COMMON_ANSWER = ("inputs-far-off", "not-converged", "camera-time-bias", "not-observable")
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 
@@ -63,7 +63,7 @@ class Deflections(Tabular):
     def history(self) -> DeflectionHistory:
         """The fused history; `GateError` with the reason where there is none."""
         if "fused" not in self.histories:
-            reason = self.refused.get("fused", Issue("the fused deflection was not asked for", "fused-missing"))
+            reason = self.refused.get("fused", Issue("the fused deflection was not asked for", "input-missing"))
             raise GateError([reason])
         return self.histories["fused"]
 
@@ -301,7 +301,7 @@ def estimate(
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None:
-                raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
+                raise GateError(f"{method}: needs a trajectory", "input-missing")
             elif method == "misalignment":
                 history = estimate_misalignment(bet)
             elif method == "trim":
@@ -324,7 +324,7 @@ def estimate(
         answered = np.isfinite(history.theta_rad)
         if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
-            answers.refused[method] = Issue(words, "camera-no-frame")
+            answers.refused[method] = Issue(words, "too-few-data")
         elif answered.any():
             answers.histories[method] = history
         else:
@@ -367,9 +367,9 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     found = fuse(bet) if answers is None else answers
     check_type("aero_increments: answers", found, Deflections, "pf.fuse(bet)")
     if found.bet is not bet:
-        raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "answers-of-another")
+        raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "argument-value")
     if found.fused is None:
-        raise GateError([found.refused.get("fused", Issue("the fused deflection was not asked for", "fused-missing"))])
+        raise GateError([found.refused.get("fused", Issue("the fused deflection was not asked for", "input-missing"))])
     return _increments(found.fused, bet)
 
 

@@ -128,7 +128,7 @@ def read_source(folder: Path, wanted: str | None = None) -> Source:
             times, covariance = stored["t_s"], stored["covariance"]
     except FileNotFoundError as fault:
         words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
-        raise GateError(f"{run}: {words}", "trajectory-missing") from None
+        raise GateError(f"{run}: {words}", "input-missing") from None
     except (ValueError, KeyError, OSError) as fault:
         raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
     deflections = {p.stem.removeprefix("deflection_"): read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
@@ -396,11 +396,11 @@ def export(folder: Path, form: str, out: Path | None, run: str | None = None) ->
         earth.require_earth(source.header.get("planet", "earth"), f"--to {form}")
     path = out or folder / "exports" / f"{source.run}.{form}"
     if (folder / "runs").resolve() in path.resolve().parents:
-        raise ConfigError(f"{path}: run folders stay as they were written; name another place", "export-into-run")
+        raise ConfigError(f"{path}: run folders stay as they were written; name another place", "file-exists")
     try:
         content = FORMS[form](source)
     except ImportError as fault:
-        raise ConfigError(f"--to {form} {missing_library(fault)}", "library-missing") from None
+        raise ConfigError(f"--to {form} {missing_library(fault)}", "package-missing") from None
     with writing(path, "name another place with --out"):
         write_file(path, content)
         if form == "msopck":

@@ -187,7 +187,7 @@ def camera_answer(
         )  # fmt: skip
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
-        raise GateError(words, "plane-assumed")
+        raise GateError(words, "keys-conflict")
     return _of_several(flight, bet, progress)
 
 
@@ -227,7 +227,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     known = any(one is not two for one, two in zip(corrected, plain, strict=True))
     at_plain = join_cameras(plain, hz) if known else joined
     unused = {one.name for one in plain} - {one.name for one in joined.readings}
-    refused |= {name: Issue("too few frames with an answer", "too-few-readings") for name in unused}
+    refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in unused}
     remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
     words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
@@ -257,9 +257,9 @@ def _with_shell_shape(
     """Films with the shell's shape under load in their answers, that shape, and a remark on it or why there is none."""
     try:
         if bet is None:
-            raise GateError("no trajectory was made", "trajectory-missing")
+            raise GateError("no trajectory was made", "input-missing")
         if flight.camera_plane_lv_rad is not None:
-            raise GateError("a plane is assumed", "plane-assumed")
+            raise GateError("a plane is assumed", "keys-conflict")
         loaded = {name: _with_pressure(film, bet) for name, film in films.items()}
         shape = shell_shape(list(loaded.values()))
     except GateError as fault:
@@ -282,7 +282,7 @@ def _benchmark(
     try:
         if bet is None:
             flight.telemetry.required_triads()
-            raise GateError("no trajectory was made", "trajectory-missing")
+            raise GateError("no trajectory was made", "input-missing")
         frames = film.relative_to_benchmark(late_s)
         return benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad), ""
     except GateError as fault:

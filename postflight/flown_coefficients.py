@@ -217,7 +217,7 @@ def increments_of(answer: FusedAnswer, confidence: float, name: str) -> AeroIncr
         Where they do not settle.
     """
     if answer.reader is None:
-        raise GateError("aerodynamic increments: the fused answer has no readings", "fused-missing")
+        raise GateError("aerodynamic increments: the fused answer has no readings", "input-missing")
     found = estimate_increments(answer.reader, answer)
     return AeroIncrements(found, answer.reader.pulse, answer, confidence, name)
 

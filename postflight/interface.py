@@ -222,7 +222,7 @@ Row = tuple[str, str, float, float, float, float]
 
 def _bet_of(answer: Deflections) -> Reconstruction:
     if answer.bet is None:
-        raise GateError("compare: these deflections were made without a trajectory", "trajectory-missing")
+        raise GateError("compare: these deflections were made without a trajectory", "input-missing")
     return answer.bet
 
 
@@ -251,7 +251,9 @@ def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]
     other = second.trajectory.time_s
     use &= (t >= other[0]) & (t <= other[-1])
     if not use.any():
-        raise GateError("compare: the two trajectories have no time of the pressure pulse in common", "no-common-time")
+        raise GateError(
+            "compare: the two trajectories have no time of the pressure pulse in common", "time-not-covered"
+        )
     apart = sizes_apart(resample(second.trajectory, t[use]), resample(first.trajectory, t[use]))
     rows: list[Row] = []
     for column, unit, _ in APART:

@@ -233,7 +233,7 @@ class Reconstruction(Tabular):
     def required_loads(self) -> FlightLoads:
         """Motion and flow at the c.g.; `GateError` with the reason where there are none."""
         if self.loads is None:
-            raise GateError("; ".join(self.missing), "loads-missing")
+            raise GateError("; ".join(self.missing), "input-missing")
         return self.loads
 
     @property

@@ -173,7 +173,7 @@ class RunFolder:
                 continue
             self.path = final
             return
-        raise GateError(f"{final}: other processes write the same run; run it again", "run-contended")
+        raise GateError(f"{final}: other processes write the same run; run it again", "cannot-write")
 
     def write_csv(self, name: str, table: pd.DataFrame) -> None:
         """Write a table."""

@@ -121,7 +121,7 @@ def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
         return table.astype(dict.fromkeys(columns, float))
     except (OSError, ValueError, KeyError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
         raise GateError(
-            f"{path}: cannot be read as a table with {', '.join(columns)}: {fault}", "table-unreadable"
+            f"{path}: cannot be read as a table with {', '.join(columns)}: {fault}", "file-unreadable"
         ) from None
 
 

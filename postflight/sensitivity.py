@@ -193,7 +193,7 @@ def _times(base: Reconstruction, other: Trajectory) -> tuple[FloatArray, int]:
         raise GateError(
             f"reaches from {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s only; the largest dynamic pressure is at "
             f"{peak_s:.3f} s",
-            code="rerun-span",
+            code="time-not-covered",
         )
     pulse = t[pressure_pulse(base.air.dynamic_pressure_pa)]
     pulse = pulse[(pulse >= other.time_s[0]) & (pulse <= other.time_s[-1])]

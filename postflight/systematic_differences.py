@@ -261,7 +261,7 @@ def systematic_differences(
     Raises
     ------
     GateError
-        ``no-common-time`` where fewer than 20 of the other's epochs lie in the run.
+        ``time-not-covered`` where fewer than 20 of the other's epochs lie in the run.
     """
     run = _with_rates(run)
     stated = covariance_time_s, covariance
@@ -339,7 +339,7 @@ class _Fit:
         if len(use) < _LEAST_EPOCHS:
             spans = [f"{t[0]:.2f} to {t[-1]:.2f} s" for t in (run.time_s, other.time_s)]
             words = f"{len(use)} of its epochs lie in the run ({spans[0]}); its own are {spans[1]}"
-            raise GateError(f"{other.label}: {words}; {_LEAST_EPOCHS} are wanted", "no-common-time")
+            raise GateError(f"{other.label}: {words}; {_LEAST_EPOCHS} are wanted", "time-not-covered")
         # the effects are smooth; their covariance is a matrix of nine times as many rows
         use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), 800)).astype(int))]
         self.run, self.stated, self.other, self.use, self.start_s, self.datum = run, stated, other, use, start_s, datum

@@ -265,7 +265,7 @@ def reconstruct_air(
         raise GateError(
             f"air: {int(keep.sum())} windows with a deceleration above {LEAST_AXIAL_MPS2} m/s^2; "
             f"at least {_LEAST_SAMPLES} are needed to estimate density and winds",
-            code="air-not-observable",
+            code="too-few-data",
         )
     samples, drag = samples.rows(keep), drag.rows(keep)
     model = _Model(samples, profile, drag)
@@ -351,7 +351,7 @@ def _least_squares(
             raise GateError(
                 "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
                 "consistency checks, and check the accelerometer's axes, units and mount",
-                code="air-not-converged",
+                code="not-converged",
             ) from None
         step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
         x = x + step
@@ -454,7 +454,7 @@ def _consistency_checks(
         check("sounding-density", "sounding density", names, estimate[density], sd[density], _BAD_DENSITY),
         check("sounding-wind", "sounding wind", wind, estimate[winds], sd[winds], _BAD_WIND),
         # C_N is not checked: a deflected aeroshell changes the normal force as a wrong C_N does
-        check("pre-flight-ca", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
+        check("pre-flight-drag", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
     )
     return tuple(v for v in checks if v is not None)
 
@@ -517,7 +517,7 @@ def too_sparse(bet: TrajectorySolution, window_s: float) -> GateError:
     return GateError(
         f"accelerometer and rates: no {window_s:.1f} s with samples of both at most {LARGEST_GAP_S:g} s apart "
         f"(usually {usual:.3g} s): forces at the c.g. need ten samples a second; deliver the data at their full rate",
-        code="samples-too-sparse",
+        code="too-few-data",
     )
 
 

@@ -156,13 +156,13 @@ def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory
     Raises
     ------
     GateError
-        ``drag-missing`` where flight.toml states no drag, ``deceleration-missing`` where nothing measures it.
+        ``drag-missing`` where flight.toml states no drag, ``input-missing`` where nothing measures it.
     """
     drag = telemetry.drag
     if drag is None:
         raise GateError("density as flown: state [drag] (c_a, area, mass) or a vehicle in flight.toml", "drag-missing")
     if history is None:
-        raise GateError("density as flown: no accelerometer and no ballistic motion", "deceleration-missing")
+        raise GateError("density as flown: no accelerometer and no ballistic motion", "input-missing")
     profile = profile_from_sounding(telemetry.sounding)
     air = air_data(path, profile, np.zeros(3))
     rho = np.exp(history.log_drag) / drag.area_per_mass_m2pkg(air.mach)

@@ -52,7 +52,7 @@ _ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # cod
 # of checks of the air; the drag shows density times C_A times area over mass: what is off may be in either file
 _AIR_SOURCES = {
     **dict.fromkeys(("sounding", "sounding-density"), ("atmosphere", "vehicle")),
-    **dict.fromkeys(("pre-flight-drag", "pre-flight-ca"), ("vehicle", "atmosphere")),
+    "pre-flight-drag": ("vehicle", "atmosphere"),
     **dict.fromkeys(("sounding-temperature", "drag-jump", "sounding-wind"), ("atmosphere",)),
     "force-residuals": ("air",),
 }

@@ -151,13 +151,13 @@ def noise_levels(
     Raises
     ------
     GateError
-        ``noise-unknown``: nothing states a level above zero. Others as `recon.reconstruct.reconstruct`.
+        ``input-missing``: nothing states a level above zero. Others as `recon.reconstruct.reconstruct`.
     """
     settings = settings or Settings.from_mapping(telemetry.reconstruction)
     report = progress or (lambda _fraction, _what: None)
     places = _places(telemetry, settings)
     if not places:
-        raise GateError("noise levels: nothing in flight.toml states one above zero", code="noise-unknown")
+        raise GateError("noise levels: nothing in flight.toml states one above zero", code="input-missing")
     stated = np.log([place.of(telemetry) for place in places])
     slow = np.array([place.field.endswith("time_constant_s") for place in places])
     prior = stated - np.where(slow, 0.0, _PRIOR_SD**2)

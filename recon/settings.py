@@ -27,7 +27,7 @@ Engine = Annotated[
 ]
 
 
-def _allowed(words: str, code: str = "setting-range") -> dict[str, str]:
+def _allowed(words: str, code: str = "value-range") -> dict[str, str]:
     return {"allowed": words, "code": code}
 
 
@@ -93,7 +93,7 @@ class Settings:
     gate_probability: Probability = field(default=0.9999, metadata=_allowed("0.5 to 1 (1 excluded)"))
     check_confidence: Probability = field(default=0.999, metadata=_allowed("0.5 to 1 (1 excluded)"))
     angle_noise: Literal["traverse", "axis"] = field(
-        default="traverse", metadata=_allowed("one of traverse, axis", "setting-choice")
+        default="traverse", metadata=_allowed("one of traverse, axis", "value-range")
     )
     consider: tuple[StrictStr, ...] = field(default=(), metadata=_allowed("a list of names"))
     without: tuple[StrictStr, ...] = field(default=(), metadata=_allowed("a list of names"))
@@ -104,7 +104,7 @@ class Settings:
         default=(), metadata=_allowed("a list of spans [from, to] in s that end after they begin")
     )
     attitude_sensors: StrictBool = field(default=False, metadata=_allowed("true or false"))
-    engine: Engine = field(default="compiled", metadata=_allowed(f"one of {', '.join(ENGINES)}", "setting-choice"))
+    engine: Engine = field(default="compiled", metadata=_allowed(f"one of {', '.join(ENGINES)}", "value-range"))
 
     def __post_init__(self) -> None:
         """Check every value once."""
@@ -115,7 +115,7 @@ class Settings:
                 object.__setattr__(self, setting.name, _rules()[setting.name].validate_python(value))
             except ValidationError:
                 shown, code = f"'{value}'" if isinstance(value, str) else f"{value}", setting.metadata["code"]
-                known = allowed.removeprefix("one of ").split(", ") if code == "setting-choice" else ()
+                known = allowed.removeprefix("one of ").split(", ") if code == "value-range" else ()
                 faults.append(Issue(f"{setting.name} {shown}{nearest_name(str(value), known)} must be {allowed}", code))
         if faults:
             raise ConfigError(faults)
@@ -133,7 +133,7 @@ class Settings:
         faults = [
             Issue(
                 f"[reconstruction] {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
-                "setting-unknown",
+                "name-unknown",
             )
             for key in values
             if key not in names

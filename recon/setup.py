@@ -176,7 +176,7 @@ def _named_model(
     faults = _unknown_sources(telemetry, settings, trackers)
     if settings.attitude_sensors and sensors is None:
         remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
-        faults.append(Issue(remark, "setting-not-applicable"))
+        faults.append(Issue(remark, "keys-conflict"))
     model = _build_error_model(telemetry, sensors, settings.attitude_sensors)
     try:
         model = model.considering(settings.consider)
@@ -200,9 +200,7 @@ def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[I
         known += ["magnetometer"] if telemetry.magnetometer is not None else []
         known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
     return [
-        Issue(
-            f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
-        )
+        Issue(f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "name-unknown")
         for name in settings.without
         if name not in known
     ]
@@ -377,7 +375,7 @@ def _span(
         raise GateError(
             "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
             "meet in one; a trajectory needs at least one",
-            code="no-track-points",
+            code="too-few-data",
         )
     else:
         start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
@@ -394,7 +392,7 @@ def _span(
         raise GateError(
             f"inertial sensors and trackers share only {start_s:.3f} to {end_s:.3f} s; "
             f"at least {_LEAST_SPAN_S:g} s are needed: check time bases and the chosen span",
-            code="span-too-short",
+            code="time-not-covered",
         )
     return float(start_s), float(end_s)
 
@@ -409,7 +407,7 @@ def _check_reach(state_s: float, settings: Settings, sensors: InertialSensors | 
         if first > state_s + 0.1:
             words = f"accelerometer and gyros begin at {first:.3f} s; carry the state there, and its covariance"
     if words:
-        raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="start-out-of-reach")
+        raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="time-not-covered")
 
 
 def _normal_of_path(state: StatePrior) -> FloatArray:
@@ -474,7 +472,7 @@ def _start_attitude(
         raise GateError(
             f"attitude prior at {prior.time_s:.3f} s: gyro samples cover {rate.time_s[0]:.3f} to "
             f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s",
-            code="attitude-prior-out-of-reach",
+            code="time-not-covered",
         )
     motion, ends = inertial_motion(force, rate, np.array([lo, hi]), planet=planet)
     first, last = (int(ends[0]), int(ends[1])) if prior.time_s < start_s else (int(ends[1]), int(ends[0]))
@@ -532,7 +530,7 @@ def fit_start(track: Track, start_s: float) -> tuple[FloatArray, FloatArray]:
     t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
         what = f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start"
-        raise GateError(what, code="too-few-track-points")
+        raise GateError(what, code="too-few-data")
     near = int(np.searchsorted(t, FIT_SPAN_S))
     count = near if near >= 2 else _LEAST_POINTS
     t, p = t[:count], p[:count]

@@ -225,7 +225,7 @@ class ErrorModel:
             if not any(_fits(b, [name]) for b in self.blocks)
         ]
         if faults:
-            raise GateError(faults, code="error-unknown")
+            raise GateError(faults, code="name-unknown")
         return ErrorModel(blocks)
 
 

@@ -9,7 +9,7 @@ over that of noise of the stated size, so that a point more or less hardly count
 
 Where no other fault explains the flight better, it is reconstructed with the tags set back, and that stands where no
 check of it fails. So it is where nothing is explained by any fault and the error state itself is large. The check
-`tracker-time` judges the lag by what is stated.
+`clock-corrected` judges the lag by what is stated.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def judged_by_the_stated(
         stated_s = record.spec.time_bias_sd_s
         symptom = f"{name}: time tags {_in_words(whole_s)} ± {sd_s:.3f}, set right"
         made = Check.of(
-            "tracker-time", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
+            "clock-corrected", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
             advice=f"more than stated (time_bias_sd_s = {stated_s:g}); or the inertial sensors' tags, and with them "
             "the trajectory's, are off as much the other way: check both", source=name, component="time bias",
         )  # fmt: skip

@@ -141,7 +141,7 @@ def reconstruct_attitude(
         raise GateError(
             f"flight '{telemetry.name}': magnetometer, Sun sensors and position share {start_s:.3f} to {end_s:.3f} s, "
             "too little for an attitude; check their time bases",
-            code="span-too-short",
+            code="time-not-covered",
         )
     knots_s = np.arange(first, last + 1.0) / settings.rate_hz
     terms = error_terms(magnetometer.spec, sun.spec, settings.unstated, float(knots_s[0]), float(knots_s[-1]))
@@ -169,7 +169,7 @@ def _required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
         if record is None
     ]
     if faults or telemetry.magnetometer is None or telemetry.sun is None:
-        raise GateError(faults, code="vector-sensors-missing")
+        raise GateError(faults, code="input-missing")
     return telemetry.magnetometer, telemetry.sun
 
 
@@ -184,7 +184,7 @@ def _place(
     time_s, points = position
     if len(time_s) == 0 or not np.isfinite(points).all():
         what = f"flight '{telemetry.name}': position is empty or not finite; the field needs a position"
-        raise GateError(what, code="position-missing")
+        raise GateError(what, code="input-missing")
     return lambda at: interpolate_rows(at, time_s, points), [(float(time_s[0]), float(time_s[-1]))]
 
 
@@ -197,7 +197,7 @@ def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     whole = np.isfinite(p).all(axis=1)
     if not whole.any():
         what = f"flight '{telemetry.name}': no radar point and no fix locates the vehicle in the Earth's field"
-        raise GateError(what, code="no-track-points")
+        raise GateError(what, code="too-few-data")
     block = np.floor(t[whole] / _TRACK_BLOCK_S)
     table = pd.DataFrame(np.column_stack([t, p])[whole]).groupby(block).median().to_numpy(copy=True)
     # within a block the vehicle moves by less than changes the field
@@ -224,7 +224,7 @@ def _solve_each(name: str, observations: list[VectorObservations], count: int) -
             if len(both)
             else "no head sees the Sun while the magnetometer measures"
         )
-        raise GateError(f"flight '{name}': no attitude from directions: {why}", code="attitude-not-observable")
+        raise GateError(f"flight '{name}': no attitude from directions: {why}", code="not-observable")
     return both[sharp], rotations.continuous(q[sharp])
 
 
@@ -241,7 +241,7 @@ def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Set
         keep[solved[k] + 1 : solved[k + 1]] = False
         remark = f"no attitude for {step[k]:.1f} s: field or Sun missing, and up to {longest:.1f} s can be bridged"
         span = float(knots_s[solved[k]]), float(knots_s[solved[k + 1]])
-        found.append(Issue(remark, "attitude-gap", "attitude check", *span))
+        found.append(Issue(remark, "too-few-data", "attitude check", *span))
     return keep, found
 
 
@@ -258,7 +258,7 @@ def _fit_findings(
     found = [
         Issue(
             f"{len(observed.knot) - kept[observed.name]} blocks edited from the attitude check",
-            "blocks-edited",
+            "points-edited",
             observed.name,
             *ends,
         )
@@ -266,7 +266,7 @@ def _fit_findings(
         if len(observed.knot) > kept.get(observed.name, len(observed.knot))
     ]
     if not fit.converged:
-        found.append(Issue(f"not converged after {fit.steps} steps", "attitude-not-converged", "attitude check", *ends))
+        found.append(Issue(f"not converged after {fit.steps} steps", "not-converged", "attitude check", *ends))
     return found
 
 
@@ -372,7 +372,7 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
         raise GateError(
             f"attitude check: the history's {t[0]:.3f} to {t[-1]:.3f} s lie outside the trajectory's "
             f"{trajectory.time_s[0]:.3f} to {trajectory.time_s[-1]:.3f} s",
-            code="no-common-span",
+            code="time-not-covered",
         )
     other = resample(trajectory, t[rows])
     off = rotations.boxminus(history.q_ecef_body[rows], other.q_ecef_body)
@@ -458,7 +458,7 @@ def start_attitude_from_vectors(telemetry: Telemetry, around_s: float) -> Attitu
             f"flight '{telemetry.name}': no attitude from directions at {around_s:.3f} s: magnetometer covers "
             f"{magnetometer.time_s[0]:.3f} to {magnetometer.time_s[-1]:.3f} s, Sun sensors {sun.time_s[0]:.3f} to "
             f"{sun.time_s[-1]:.3f} s",
-            code="no-common-span",
+            code="time-not-covered",
         )
     part = replace(
         telemetry,

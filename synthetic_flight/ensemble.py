@@ -104,7 +104,7 @@ def fly_ensemble(
     if workers < 1 or schedule.records < 1 or schedule.per_record < 1 or not schedule.step_s > 0.0:
         raise ConfigError(
             f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}",
-            code="ensemble-arguments",
+            code="argument-value",
         )
     check_mass(vehicle)
     if schedule.frees_joint:
@@ -262,11 +262,11 @@ SCALARS = (
 def check_outputs(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     """Raise `ConfigError` with every name that is unknown or comes twice."""
     faults = [
-        Issue(f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}", "output-unknown")
+        Issue(f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}", "name-unknown")
         for n in names
         if n not in known
     ]
-    faults += [Issue(f"output '{n}' comes twice", "output-twice") for n in dict.fromkeys(names) if names.count(n) > 1]
+    faults += [Issue(f"output '{n}' comes twice", "given-twice") for n in dict.fromkeys(names) if names.count(n) > 1]
     if faults:
         raise ConfigError(faults)
 
@@ -295,7 +295,7 @@ def _histories_of(records: Records, names: tuple[str, ...], window: Window) -> F
 def records_of(flown: Flown, vehicle: Vehicle, atmosphere: FloatArray) -> Records:
     """Return what a flight recorded; `GateError` where it did not reach its window."""
     if not len(flown.aux):
-        raise GateError("no record: the joint diverged, or the state was not finite, before the window", "no-record")
+        raise GateError("no record: the joint diverged, or the state was not finite, before the window", "too-few-data")
     return Records(flown.states, flown.aux, vehicle, atmosphere)
 
 
@@ -339,7 +339,7 @@ def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
         raise ConfigError(
             f"window: {max(inflated, begins):g} (inflated) <= from_s = {window.from_s:g} < to_s = {window.to_s:g} <= "
             f"{time.stop_s:g} (the scenario's stop_s) is wanted",
-            code="window-outside-flight",
+            code="time-not-covered",
         )
     out = []
     for start, end, step, lock in (

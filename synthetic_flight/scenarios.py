@@ -220,7 +220,7 @@ def shipped_scenarios() -> list[str]:
 def read_scenario(name: str | Path) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
     check_type("scenario", name, (str, Path), "a shipped name or the path of a TOML file")
-    path = path_of("scenario", str(name), "scenario-unknown")
+    path = path_of("scenario", str(name), "name-unknown")
     tables = read_toml(path)
     spec, vehicle = None, None
     faults: list[Issue] = []
@@ -254,7 +254,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Is
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
             message = f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}"
-            faults.append(Issue(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
+            faults.append(Issue(message, "name-unknown"))
     return faults
 
 

@@ -195,7 +195,7 @@ def mean_air(
     Raises
     ------
     ConfigError
-        Where its sounding cannot be read, or NRLMSIS is asked for without the library (``nrlmsis-missing``).
+        Where its sounding cannot be read, or NRLMSIS is asked for without the library (``package-missing``).
     """
     if spec.from_ is not None:
         base: AtmosphereProfile | None = _measured(folder / spec.from_)

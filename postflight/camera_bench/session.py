@@ -185,7 +185,7 @@ class Session:
         """
         frames = self._work.frames
         if len(rows) > MOST_EDITS:
-            raise GateError(f"{len(rows)} edits; at most {MOST_EDITS}", code="edit-too-long")
+            raise GateError(f"{len(rows)} edits; at most {MOST_EDITS}", code="value-range")
         wanted = [_edit_of(row, frames.camera_name) for row in rows]
         faults = faults_of(wanted, frames.time_s, frames.camera.size_px)
         if faults:
@@ -311,9 +311,9 @@ def _edit_of(row: dict[str, Any], camera: str) -> Edit:
         numbers = {k: float("nan") if row.get(k) is None else float(row[k]) for k in ("t_s", "u_px", "v_px", "value")}
         words: dict[str, str] = {k: row.get(k, "") for k in ("edit", "name", "note")}
     except (TypeError, ValueError, AttributeError):
-        raise GateError("camera edits: no edit", code="edit-unknown") from None
+        raise GateError("camera edits: no edit", code="edit-unusable") from None
     if not all(isinstance(word, str) for word in words.values()):
-        raise GateError("camera edits: no edit", code="edit-unknown")
+        raise GateError("camera edits: no edit", code="edit-unusable")
     t_s, u_px, v_px, value = (numbers[k] for k in ("t_s", "u_px", "v_px", "value"))
     return Edit(camera, t_s, words["edit"], words["name"], u_px, v_px, value, words["note"])
 

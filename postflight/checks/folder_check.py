@@ -244,7 +244,7 @@ def _cross_check(found: Sources, report: Report) -> None:
         _against_accelerometer(found, name, record, report)
     strapdown = found.spec.motion.model == "strapdown"
     swings = inertial.oscillation_of(found.triads if strapdown else {}, found.vehicle)
-    remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
+    remarks += [f for f in swings.remarks if not any(map(_doubts_accelerometer, remarks))]
     _keep_sharp(report, swings.bias)
     rotation, lag = pressure_and_field.field_rotation(found)
     if lag is not None:
@@ -258,6 +258,11 @@ def _cross_check(found: Sources, report: Report) -> None:
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
     report.findings += text_in_films(found) + frozen_films(found)
+
+
+def _doubts_accelerometer(remark: Issue) -> bool:
+    """Whether a remark says that the accelerometer's unit, scale or axes are wrong."""
+    return remark.source == "accelerometer" and remark.code in ("unit-suspect", "accelerometer-scale", "axes-suspect")
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
@@ -282,7 +287,7 @@ def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report:
     force = track_force(record.time_s, tracks.position_of(record, found.spec.body), _FORCE_WIDTH_S, found.spec.body)
     if force is None or "accelerometer" not in found.triads:
         return
-    if not any(f.code == "accelerometer-axes" for f in remarks):
+    if not any(f.source == "accelerometer" and f.code == "axes-suspect" for f in remarks):
         remarks += inertial.entry_axis(found, force)
     if not remarks:
         remarks += inertial.gyro_axes(found, force)
@@ -399,7 +404,7 @@ def text_in_films(found: Sources) -> list[Issue]:
 
 
 def frozen_films(found: Sources) -> list[Issue]:
-    """Find pictures that a film repeats to the last bit, which noise forbids: ``film-frozen`` for each stretch."""
+    """Find pictures that a film repeats to the last bit, which noise forbids: ``frame-frozen`` for each stretch."""
     return [one for name, film in found.films.items() for one in _repeats(name, film)]
 
 
@@ -416,6 +421,6 @@ def _repeats(name: str, film: Frames) -> list[Issue]:
         start, end = float(film.time_s[first]), float(film.time_s[max(k - 1, 0)])
         if k - first >= _FROZEN_FRAMES and end - start >= FROZEN_S:
             words = f"{k - first} frames repeat one picture: the film stood still there; leave them out (use_s)"
-            out.append(Issue(words, "film-frozen", name, start, end))
+            out.append(Issue(words, "frame-frozen", name, start, end))
         first, before = k, now
     return out

@@ -65,13 +65,13 @@ _FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
 _DEGREE = np.pi / 180.0
 # slips in writing a quaternion: hint and code, and the order that undoes it (None: the conjugate)
 _SLIPS = {
-    Issue("with the scalar last, so put its last number first", "attitude-scalar-last"): [3, 0, 1, 2],
-    Issue("as from ECEF to body, so change the signs of its last three numbers", "attitude-inverted"): None,
+    Issue("with the scalar last, so put its last number first", "attitude-convention"): [3, 0, 1, 2],
+    Issue("as from ECEF to body, so change the signs of its last three numbers", "attitude-convention"): None,
 }
 
 
 def sparse(found: Sources) -> list[Issue]:
-    """Name sensors whose samples are too far apart for the forces of a flight (``samples-too-sparse``)."""
+    """Name sensors whose samples are too far apart for the forces of a flight (``too-few-data``)."""
     if found.spec.motion.model == "ballistic":
         return []
     out = []
@@ -81,7 +81,7 @@ def sparse(found: Sources) -> list[Issue]:
         if record is not None and step > 1.01 * LARGEST_GAP_S:
             words = f"samples are usually {step:.3g} s apart: forces at the c.g. need ten a second, an attitude more"
             ends = float(record.time_s[0]), float(record.time_s[-1])
-            out.append(Issue(f"{words}; deliver the data at their full rate", "samples-too-sparse", name, *ends))
+            out.append(Issue(f"{words}; deliver the data at their full rate", "too-few-data", name, *ends))
     return out
 
 
@@ -96,7 +96,7 @@ def at_rest(found: Sources) -> list[Issue]:
     Returns
     -------
     list of Issue
-        ``accelerometer-unit``, or none.
+        ``unit-suspect``, or none.
     """
     record, rates = found.triads.get("accelerometer"), found.triads.get("rates")
     if record is None or rates is None:
@@ -116,12 +116,12 @@ def at_rest(found: Sources) -> list[Issue]:
         hint = unit_hint(declared, unit_that_explains(earth.STANDARD_GRAVITY_MPS2 / mean, declared, 0.02))
         if hint:
             words = f"reads {mean:.4g} m/s2 at rest, where 9.81 is expected{hint}"
-            return [Issue(words, "accelerometer-unit", "accelerometer", float(start), float(start + _REST_S))]
+            return [Issue(words, "unit-suspect", "accelerometer", float(start), float(start + _REST_S))]
     return []
 
 
 def against_track(found: Sources, tracker: str, seen: Comparison) -> list[Issue]:
-    """Check the accelerometer's scale against a track's: ``accelerometer-unit``, ``accelerometer-scale`` or none."""
+    """Check the accelerometer's scale against a track's: ``unit-suspect``, ``accelerometer-scale`` or none."""
     if seen.scale <= 0.0 or seen.scale_sd > 0.1 * seen.scale or 1 / _FAR < seen.scale < _FAR:
         return []
     if abs(np.log(seen.scale)) * seen.scale < _SURE * seen.scale_sd:
@@ -129,13 +129,13 @@ def against_track(found: Sources, tracker: str, seen: Comparison) -> list[Issue]
     declared = _accelerometer_unit(found)
     hint = unit_hint(declared, unit_that_explains(seen.scale, declared, max(0.05, 3.0 * seen.scale_sd / seen.scale)))
     words = f"{tracker}'s track implies {seen.scale:.3g} +/- {seen.scale_sd:.2g} times its reading"
-    code = "accelerometer-unit" if hint else "accelerometer-scale"
+    code = "unit-suspect" if hint else "accelerometer-scale"
     words += hint or "; no other unit explains it: check both units"
     return [Issue(words, code, "accelerometer", seen.start_s, seen.end_s)]
 
 
 def entry_axis(found: Sources, force: TrackForce) -> list[Issue]:
-    """Check that the drag in descent is read along -x of the body: ``accelerometer-axes`` or none."""
+    """Check that the drag in descent is read along -x of the body: ``axes-suspect`` or none."""
     record = found.triads.get("accelerometer")
     if record is None or found.vehicle is None:
         return []
@@ -162,11 +162,11 @@ def entry_axis(found: Sources, force: TrackForce) -> list[Issue]:
         "check mount, column order, signs"
     )
     times = force.time_s[strong]
-    return [Issue(words, "accelerometer-axes", "accelerometer", float(times[0]), float(times[-1]))]
+    return [Issue(words, "axes-suspect", "accelerometer", float(times[0]), float(times[-1]))]
 
 
 def lever(found: Sources) -> list[Issue]:
-    """Check the gyros' unit by the centripetal acceleration at the accelerometer: ``gyro-unit`` or none."""
+    """Check the gyros' unit by the centripetal acceleration at the accelerometer: ``unit-suspect`` or none."""
     record, rates, vehicle = found.triads.get("accelerometer"), found.triads.get("rates"), found.vehicle
     source = found.spec.sensors.rates
     if record is None or rates is None or vehicle is None or source is None:
@@ -186,7 +186,7 @@ def lever(found: Sources) -> list[Issue]:
         f"imply a centripetal acceleration of {float(np.nanmedian(inward)):.3g} m/s2 at the accelerometer, which reads "
         f"{float(np.nanmedian(felt)):.2g} (medians){hint}"
     )
-    return [Issue(words, "gyro-unit", "rates", float(rates.time_s[0]), float(rates.time_s[-1]))]
+    return [Issue(words, "unit-suspect", "rates", float(rates.time_s[0]), float(rates.time_s[-1]))]
 
 
 def place(found: Sources) -> list[Issue]:
@@ -232,7 +232,7 @@ def gyro_axes(found: Sources, force: TrackForce) -> list[Issue]:
     Returns
     -------
     list of Issue
-        ``gyro-unit``, ``gyro-axes``, ``gyro-rotation`` (which of both is open), or none.
+        ``unit-suspect``, ``axes-suspect``, ``axes-suspect`` (which of both is open), or none.
     """
     gyros, sensed = found.triads.get("rates"), found.triads.get("accelerometer")
     source = found.spec.sensors.rates
@@ -268,10 +268,10 @@ def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) 
     """Code and hint of what would mend the rates: all good readings differ by unit alone, by axes alone, or by both."""
     scale, axes = best
     if all(r[1] == AS_DECLARED for r in near):
-        return "gyro-unit", unit_hint(declared, unit_that_explains(scale, declared))
+        return "unit-suspect", unit_hint(declared, unit_that_explains(scale, declared))
     if all(r[0] == 1.0 for r in near):
-        return "gyro-axes", f"; with body x, y, z read from {axes_named(*axes)} it is {np.rad2deg(off_rad):.0f} deg"
-    return "gyro-rotation", ": check their unit, order and signs"
+        return "axes-suspect", f"; with body x, y, z read from {axes_named(*axes)} it is {np.rad2deg(off_rad):.0f} deg"
+    return "axes-suspect", ": check their unit, order and signs"
 
 
 def attitude_prior(found: Sources, force: TrackForce) -> list[Issue]:

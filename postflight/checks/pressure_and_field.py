@@ -38,7 +38,7 @@ _LARGEST_LAG_S, _COARSE_S = 0.5, 0.025  # of a clock set to half a second; a six
 
 
 def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray) -> list[Issue]:
-    """Check a barometer's unit by its changes of height against a track's: ``barometer-unit`` or none.
+    """Check a barometer's unit by its changes of height against a track's: ``unit-suspect`` or none.
 
     The track has heights above the ellipsoid (n,) at its times (n,).
     """
@@ -61,11 +61,11 @@ def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, 
     if not hint or sd > 0.05 * ratio:
         return []
     words = f"its height changes by 1/{ratio:.3g} of the track's{hint}"
-    return [Issue(words, "barometer-unit", name, float(t[inside][0]), float(t[inside][-1]))]
+    return [Issue(words, "unit-suspect", name, float(t[inside][0]), float(t[inside][-1]))]
 
 
 def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) -> list[Issue]:
-    """Check the magnitude of the magnetometer's reading against the Earth's field: ``magnetometer-unit`` or none.
+    """Check the magnitude of the magnetometer's reading against the Earth's field: ``unit-suspect`` or none.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) 
     hint = unit_hint(declared, unit_that_explains(ratio, declared, np.log(3.0)))
     words = f"reads {1e6 * float(np.median(seen)):.3g} uT where the Earth's field is {1e6 * expected:.3g} uT{hint}"
     times = record.time_s[rows]
-    return [Issue(words, "magnetometer-unit", "magnetometer", float(times[0]), float(times[-1]))]
+    return [Issue(words, "unit-suspect", "magnetometer", float(times[0]), float(times[-1]))]
 
 
 def field_rotation(found: Sources) -> tuple[list[Issue], tuple[float, float] | None]:
@@ -103,7 +103,7 @@ def field_rotation(found: Sources) -> tuple[list[Issue], tuple[float, float] | N
     Returns
     -------
     findings : list of Issue
-        ``gyro-axes``, ``gyro-unit``, or none.
+        ``axes-suspect``, ``unit-suspect``, or none.
     lag : (float, float) or None
         How late the magnetometer's time tags are against the gyros', s, and its standard deviation; None where the
         gyros do not explain the rotation.
@@ -130,13 +130,13 @@ def field_rotation(found: Sources) -> tuple[list[Issue], tuple[float, float] | N
             f"explain {100 * own:.0f} % of the field's rotation in the body; with body x, y, z read from {others} it "
             f"is {100 * best:.0f} %: check order, signs and both mounts"
         )
-        return [Issue(words, "gyro-axes", "rates", *span)], None
+        return [Issue(words, "axes-suspect", "rates", *span)], None
     out: list[Issue] = []
     if own > _EXPLAINED and not 0.8 < scale < 1.25:
         declared = unit_of(source, tables.RATES[0])
         hint = unit_hint(declared, unit_that_explains(scale, declared, 0.2))
         out.append(
-            Issue(f"the field rotates {scale:.3g} times as fast as they read{hint}", "gyro-unit", "rates", *span)
+            Issue(f"the field rotates {scale:.3g} times as fast as they read{hint}", "unit-suspect", "rates", *span)
         )
     return out, _lag(gyros, field) if own > _EXPLAINED else None
 

@@ -400,7 +400,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     Raises
     ------
     ConfigError
-        ``flight-file-missing``, or ``file-exists`` where one would be overwritten.
+        ``file-missing``, or ``file-exists`` where one would be overwritten.
     GateError
         Every table file in which no table is found, with the codes of `postflight.intake.stored_tables`.
 
@@ -409,7 +409,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     path = folder / "flight.toml"
     if not path.exists():
         words = f"no flight.toml; make one with `postflight init {folder}`"
-        raise ConfigError(f"{folder}: {words}", code="flight-file-missing")
+        raise ConfigError(f"{folder}: {words}", code="file-missing")
     tables = read_toml(path)
     came = _delivered(files, folder)
     _coefficients(came, folder, tables)
@@ -496,7 +496,7 @@ def _beside_pictures(folder: Path, video: Video) -> list[Issue]:
         return []
     others = sorted(p.name for p in folder.iterdir() if p.name not in video.names)
     words = f"{folder}: beside its pictures {', '.join(others[:5])}{' ...' if others[5:] else ''}"
-    return [Issue(words, "no-picture")] if others else []
+    return [Issue(words, "nothing-to-import")] if others else []
 
 
 def _bytes_of(file: Path) -> bytes:
@@ -572,7 +572,7 @@ def _proposals(
         for source in found:
             if source.section in taken:
                 words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
-                unused_tables.append(Issue(words, "second-of-its-kind"))
+                unused_tables.append(Issue(words, "given-twice"))
             added.append(section_text(source, file, table.notes, source.section in taken))
             taken.add(source.section)
     listed = "".join(added)
@@ -587,7 +587,7 @@ def _not_recognised(table: FreeFormTable, file: str) -> Issue:
     if recogniser.is_sounding():
         without = _missing_of_a_radiosonde({q.short: m for q, m in recogniser.air_columns().items()}) or "three levels"
         words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
-        return Issue(words, "sounding-incomplete")
+        return Issue(words, "column-missing")
     if recogniser.time is None:
         first = [f"'{name}' {cells[0]}" for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
         shown = ", ".join(first)
@@ -595,9 +595,9 @@ def _not_recognised(table: FreeFormTable, file: str) -> Issue:
             f"{file}: no column of times is recognised, and without one nothing else is (the first row has {shown}); "
             "docs/own-data.md lists the times that are read; or declare its columns in flight.toml"
         )
-        return Issue(words, "not-recognised")
+        return Issue(words, "column-missing")
     words = f"{file}: nothing recognised among {', '.join(table.names)}; declare its columns in flight.toml"
-    return Issue(words, "not-recognised")
+    return Issue(words, "column-missing")
 
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:

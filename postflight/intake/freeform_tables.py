@@ -99,8 +99,8 @@ def read_text_table(path: Path) -> FreeFormTable:
     Raises
     ------
     GateError
-        ``table-missing`` where no names above three rows of numbers are found, ``table-too-large``,
-        ``table-binary``, or ``file-missing``.
+        ``file-unreadable`` where no names above three rows of numbers are found, ``file-too-large``,
+        ``file-unreadable``, or ``file-missing``.
     """
     with refusing_unfit(path):
         raw = file_bytes(path)
@@ -126,7 +126,7 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     Raises
     ------
     GateError
-        ``table-missing`` where no names above three rows of numbers are found.
+        ``file-unreadable`` where no names above three rows of numbers are found.
     """
     ruled = _ruled(label, lines)
     if ruled is not None:
@@ -135,7 +135,7 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     found = _layout(lines[:_HEAD_LINES])
     if found is None:
         words = "no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
-        raise GateError(f"{where}: {words}", code="table-missing")
+        raise GateError(f"{where}: {words}", code="file-unreadable")
     delimiter, first, header, unit_row = found
     names = [n.strip() for n in header]
     units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
@@ -195,7 +195,7 @@ def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace"), ["UTF-16 became UTF-8"]
     if b"\0" in raw[:65536]:
-        raise GateError(f"{path}: binary data where a text table is wanted", code="table-binary")
+        raise GateError(f"{path}: binary data where a text table is wanted", code="file-unreadable")
     try:
         return raw.decode("utf-8-sig"), []
     except UnicodeDecodeError:

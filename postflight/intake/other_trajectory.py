@@ -98,9 +98,9 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     Raises
     ------
     GateError
-        What `read_tables` refuses; ``oem-syntax``, ``oem-frame``, ``oem-time-system``; ``no-trajectory`` where no table
-        holds times and positions, ``unit-missing`` where a column's unit is not stated, ``position-range``,
-        ``time-order``.
+        What `read_tables` refuses; ``oem-frame``; ``file-unreadable`` where no table
+        holds times and positions, ``unit-unknown`` where a column's unit is not stated, ``value-range``,
+        ``time-backwards``.
     """
     try:
         content = file_bytes(path)
@@ -113,7 +113,7 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     found = _near_earth(path, found)
     if len(found.time_s) < LEAST_ROWS or (np.diff(found.time_s) <= 0.0).any():
         words = f"{LEAST_ROWS} states in the order of their times are wanted, each time once"
-        raise GateError(f"{path}: {words}", "time-order")
+        raise GateError(f"{path}: {words}", "time-backwards")
     return found
 
 
@@ -123,7 +123,7 @@ def _near_earth(path: Path, found: OtherTrajectory) -> OtherTrajectory:
     keep = (distance_m > _NEAR_M[0]) & (distance_m < _NEAR_M[1])
     if len(keep) and not keep.any():
         words = f"positions are {np.median(distance_m):.4g} m from the Earth's centre: of another unit or frame"
-        raise GateError(f"{path}: {words}", "position-range")
+        raise GateError(f"{path}: {words}", "value-range")
     return found.part(keep, f"{int((~keep).sum())} of {len(keep)} states in the Earth or far from it are left out")
 
 
@@ -147,7 +147,7 @@ def _read_oem(path: Path, text: str, epoch: datetime) -> OtherTrajectory:
             faults.append(GateError(f"{path}: line {line}: {words}", "oem-frame").faults[0])
         if key == "TIME_SYSTEM" and value.upper() != "UTC":
             words = f"TIME_SYSTEM = {value}; UTC is wanted (GPS is 18 s ahead of it since 2017)"
-            faults.append(GateError(f"{path}: line {line}: {words}", "oem-time-system").faults[0])
+            faults.append(GateError(f"{path}: line {line}: {words}", "oem-frame").faults[0])
     if faults:
         raise GateError(faults)
     rows = []
@@ -216,14 +216,14 @@ def _oem_covariances(path: Path, message: _Oem, epoch: datetime) -> tuple[FloatA
             times.append(_seconds(stamp, epoch))
         except ValueError:
             raise GateError(
-                f"{path}: covariance at {stamp}: six rows of 1 to 6 numbers are wanted", "oem-syntax"
+                f"{path}: covariance at {stamp}: six rows of 1 to 6 numbers are wanted", "file-unreadable"
             ) from None
         matrices.append(1e6 * (matrix + np.tril(matrix, -1).T))
     return np.array(times), np.array(matrices).reshape(-1, 6, 6), skipped
 
 
 def _oem_syntax(path: Path, line: int, words: str) -> GateError:
-    return GateError(f"{path}: line {line}: {words}", "oem-syntax")
+    return GateError(f"{path}: line {line}: {words}", "file-unreadable")
 
 
 def _seconds(stamp: str, epoch: datetime) -> float:
@@ -246,12 +246,12 @@ def _read_table(path: Path, epoch: datetime) -> OtherTrajectory:
         if found is not None:
             return found
     if refused:
-        raise GateError(f"{path}: {'; '.join(refused)}", "unit-missing")
+        raise GateError(f"{path}: {'; '.join(refused)}", "unit-unknown")
     words = (
         "no table with times and positions: t_s or utc; x_ecef_m, y_ecef_m, z_ecef_m or lat_deg, lon_deg, alt_m; "
         "and if known vx_ecef_mps ... or vn_mps, ve_mps, vd_mps, and qw_ecef_body ... (columns of bet.csv)"
     )
-    raise GateError(f"{path}: {words}", "no-trajectory")
+    raise GateError(f"{path}: {words}", "file-unreadable")
 
 
 def _columns(table: FreeFormTable, names: tuple[str, ...]) -> FloatArray | None:

@@ -96,26 +96,26 @@ def read_tables(path: Path) -> list[FreeFormTable]:
     Raises
     ------
     GateError
-        ``file-missing``, ``table-missing``, ``table-too-large``, ``table-unreadable`` (``matlab-unreadable``),
-        ``table-old-excel``, and what `read_text_table` refuses.
+        ``file-missing``, ``file-unreadable``, ``file-too-large``, ``file-unreadable`` (``file-unreadable``),
+        ``file-unreadable``, and what `read_text_table` refuses.
     ConfigError
-        ``library-missing`` (``h5py-missing`` for MATLAB) with the command that installs the library.
+        ``package-missing`` (``package-missing`` for MATLAB) with the command that installs the library.
     """
     with refusing_unfit(path), open_file(path) as file:
         head = file.read(1024)  # MATLAB 7.3 has HDF5's mark behind a preface of 512
     if path.suffix.lower() == ".mat":
         version = _version_73 if b"MATLAB 7.3" in head or _HDF5 in head else _version_5
-        return _guarded(path, lambda path: _matlab(path, version(path)), "matlab-unreadable", "h5py-missing")
+        return _guarded(path, lambda path: _matlab(path, version(path)), "file-unreadable", "package-missing")
     if head.startswith(b"\xd0\xcf\x11\xe0"):
         words = "a spreadsheet in the format of before 2007; save it as .xlsx or CSV"
-        raise GateError(f"{path}: {words}", code="table-old-excel")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
     if head.startswith(b"PK\x03\x04") and _is_workbook(path):
         return _guarded(path, _workbook)
     if head.startswith(b"PAR1"):
         return _guarded(path, _parquet)
     if head.startswith(b"CDF"):
         if head[3:4] not in (b"\x01", b"\x02"):  # versions that scipy reads
-            raise GateError(f"{path}: NetCDF in 64-bit data format; store it as version 4", code="table-unreadable")
+            raise GateError(f"{path}: NetCDF in 64-bit data format; store it as version 4", code="file-unreadable")
         return _guarded(path, _netcdf_classic)
     if _HDF5 in head:
         return _guarded(path, _netcdf_4)
@@ -125,8 +125,8 @@ def read_tables(path: Path) -> list[FreeFormTable]:
 def _guarded(
     path: Path,
     read: Callable[[Path], list[FreeFormTable]],
-    unreadable: str = "table-unreadable",
-    missing: str = "library-missing",
+    unreadable: str = "file-unreadable",
+    missing: str = "package-missing",
 ) -> list[FreeFormTable]:
     """Tables of a file; whatever a library says of a damaged one becomes a refusal with the code ``unreadable``."""
     try:
@@ -140,7 +140,7 @@ def _guarded(
         raise GateError(f"{path}: {words}", code=unreadable) from None
     if not tables:
         words = f"no table found: two columns of numbers of one length, {LEAST_ROWS} rows at least, are wanted"
-        raise GateError(f"{path}: {words}", code="table-missing")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
     return tables
 
 
@@ -165,12 +165,12 @@ def _check_readable(path: Path, kind: str) -> None:
         words = (
             f"a damaged file: the library for {kind} {fate}; compare its checksum with the sender's, or have it as CSV"
         )
-        raise GateError(f"{path}: {words}", code="table-unreadable")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
 
 
 def _check_size(path: Path, numbers: int) -> None:
     if numbers > _MOST_NUMBERS:
-        raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="table-too-large")
+        raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="file-too-large")
 
 
 def _cells(values: NDArray[Any]) -> list[str]:
@@ -209,7 +209,7 @@ def _workbook(path: Path) -> list[FreeFormTable]:
 
     with zipfile.ZipFile(path) as archive:
         if sum(part.file_size for part in archive.infolist()) > TABLE_BYTES:
-            raise GateError(f"{path}: unpacks to more than {TABLE_BYTES} bytes; split it", code="table-too-large")
+            raise GateError(f"{path}: unpacks to more than {TABLE_BYTES} bytes; split it", code="file-too-large")
     book = openpyxl.load_workbook(path, read_only=True, data_only=True, keep_links=False)
     tables, without = [], []
     try:
@@ -404,7 +404,7 @@ def _matlab(path: Path, tree: Tree) -> list[FreeFormTable]:
         tables.append(_table(label, columns, ["MATLAB numbers became CSV"], left_out))
     if not tables:
         words = f"no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
-        raise GateError(f"{path}: {words}", code="table-missing")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
     return tables
 
 

@@ -161,7 +161,7 @@ def merge(study: Study, folder: Path, flights: int) -> Merged:
         if chunk is None:
             missing = sum(read_chunk(folder, j, r, False) is None for j, r in enumerate(wanted))
             message = f"{folder}: {missing} of {len(wanted)} chunks are missing; the same run command flies them"
-            raise GateError(message, code="chunk-missing")
+            raise GateError(message, code="study-damaged")
         parts.append(chunk)
     names = list(study.plan.scalars)
     table = pd.DataFrame(np.concatenate([c.scalars for c in parts]), columns=names)
@@ -248,7 +248,7 @@ def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tu
         chunk = read_chunk(folder, number, runs)
         if chunk is None:
             message = f"{folder}: chunk {number} was damaged while it was read; run again"
-            raise GateError(message, code="chunk-damaged")
+            raise GateError(message, code="study-damaged")
         kept = chunk.histories[chunk.flown]
         out[:, :, count : count + len(kept)] = np.moveaxis(kept, 0, -1)
         count += len(kept)

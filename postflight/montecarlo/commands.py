@@ -56,7 +56,7 @@ def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
     if wanted.scheduler is not None and execution.is_open(wanted.scheduler):
         words = f"--scheduler {wanted.scheduler}: not encrypted, and whoever reaches its port can run code there; use tls://"
-        console.coded("[yellow]found[/]", words, "scheduler-open")
+        console.coded("[yellow]found[/]", words, "scheduler-unreachable")
     try:
         with progress_bar() as report:
             return execution.run(study, folder, wanted, report)

@@ -197,13 +197,13 @@ def begin(study: Study, folder: Path, flights: int) -> None:
             message = (
                 f"{folder}: flown by version {held['version']}, this is {version('postflight')}; name a new folder"
             )
-            raise ConfigError(message, code="study-version")
+            raise ConfigError(message, code="file-exists")
         if flights < held["flights"]:
             message = f"{folder}: holds a study of {held['flights']} flights; at least as many are wanted"
-            raise ConfigError(message, code="study-larger")
+            raise ConfigError(message, code="file-exists")
     elif folder.exists() and any(folder.iterdir()):
         message = f"{folder}: is not empty and holds no study.json; name a new folder"
-        raise ConfigError(message, code="folder-not-empty")
+        raise ConfigError(message, code="file-exists")
     (folder / "chunks").mkdir(parents=True, exist_ok=True)
     remove_partial(folder)
     _note(folder, settings, flights, study.named)
@@ -224,7 +224,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
             raise ValueError("not a study")
     except FileNotFoundError:
         message = f"{folder}: no study.json; begin with `postflight montecarlo run`"
-        raise GateError(message, code="study-missing") from None
+        raise GateError(message, code="file-missing") from None
     except (ValueError, KeyError, TypeError) as fault:
         raise GateError(f"{path}: damaged: {fault}", code="study-damaged") from None
     found: dict[str, Any] = held
@@ -255,7 +255,7 @@ def _check_same(folder: Path, held: dict[str, Any], asked: dict[str, Any]) -> No
     ]
     more = [f"{folder}: {len(differ)} settings differ in all"] * (len(differ) > MOST_DIFFERENCES)
     remedy = f"{folder}: name a new folder, or restore the settings"
-    raise ConfigError([*lines, *more, remedy], code="study-differs")
+    raise ConfigError([*lines, *more, remedy], code="file-exists")
 
 
 class _Enough:

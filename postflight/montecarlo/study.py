@@ -159,7 +159,7 @@ def dispersions_path(name: str) -> Path:
     shipped = shipped_dispersions()
     if name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no dispersions file '{name}'{hint}", code="dispersions-unknown")
+        raise ConfigError(f"no dispersions file '{name}'{hint}", code="name-unknown")
     return DATA / "dispersions" / f"{name}.toml"
 
 

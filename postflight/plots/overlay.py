@@ -101,7 +101,7 @@ def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: P
     with _without_standard_error():  # OpenCV warns there that it takes another tag for VP9, which is no fault
         writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"VP90"), round(rate, 3), size)
     if not writer.isOpened():
-        raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "film-codec-missing")
+        raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "package-missing")
     try:
         for k, image in enumerate(frames.pictures()):
             progress(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")

@@ -223,7 +223,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
 def _modal(flight: Reconstruction, fit: JointFit) -> ModalStiffness:
     """Stiffness by the joint's frequency, looked for about the fit's."""
     if stiffness_bound(fit) is not None:
-        raise GateError("modes: the joint is too stiff to be seen oscillating", code="mode-not-detected")
+        raise GateError("modes: the joint is too stiff to be seen oscillating", code="not-observable")
     return stiffness_from_modes(flight, fit.vehicle.joint.bending_stiffness_nmprad)
 
 
@@ -419,7 +419,7 @@ def _frequency(fit: JointFit, modal: ModalStiffness) -> Check:
 def _convergence(fit: JointFit) -> Check:
     """Whether the last step had nothing left to gain."""
     return Check.of(
-        "joint-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
+        "not-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
         f"converged in {fit.steps} steps", f"not converged after {fit.steps} steps",
         advice="estimates and intervals are those of the last step",
     )  # fmt: skip

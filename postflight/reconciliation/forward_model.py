@@ -441,7 +441,7 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
     if loaded:
         falling &= air.dynamic_pressure_pa > 0.1 * pulse.dynamic_pressure_pa.max()
     if not falling.any():
-        raise GateError("reconciliation: the reconstruction never comes below 100 km", code="entry-missing")
+        raise GateError("reconciliation: the reconstruction never comes below 100 km", code="time-not-covered")
     first_s = float(np.ceil(air.time_s[np.argmax(falling)] / WINDOW_S) * WINDOW_S)
     last_s = float(pulse.time_s[np.flatnonzero(pulse.through_pulse)[-1]])
     spans = int((last_s - first_s) / SPAN_S)

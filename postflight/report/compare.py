@@ -54,7 +54,7 @@ def locate(word: str) -> Path:
     Raises
     ------
     GateError
-        ``run-incomplete``, ``run-unknown`` or ``run-missing``.
+        ``run-incomplete``, ``name-unknown`` or ``run-missing``.
     """
     path = Path(word)
     is_flight = (path / "flight.toml").is_file() or (path / "runs").is_dir()
@@ -68,7 +68,7 @@ def locate(word: str) -> Path:
     if (path.parent / "flight.toml").is_file() or (path.parent / "runs").is_dir():
         return find_run(path.parent, path.name)
     words = "no run: name a run's folder, a flight's, or FLIGHT/RUN with a run's name, such as my-flight/plain"
-    raise GateError(f"{word}: {words}", "run-unknown")
+    raise GateError(f"{word}: {words}", "name-unknown")
 
 
 def compare(words: tuple[str, ...], output: Path | None) -> None:
@@ -85,9 +85,9 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
     Raises
     ------
     ConfigError
-        Too few, too many or equal runs; ``compare-one-file`` where a file does not stand behind one run.
+        Too few, too many or equal runs; ``compare-runs`` where a file does not stand behind one run.
     GateError
-        What a file is refused for; every word that means no run, runs that cannot be read; ``folder-exists`` where the
+        What a file is refused for; every word that means no run, runs that cannot be read; ``file-exists`` where the
         folder holds other things.
     """
     if any(Path(word).is_file() for word in words):
@@ -114,7 +114,7 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
 def _compare_with_file(words: tuple[str, ...], output: Path | None) -> None:
     """Print and write the comparison of a run with another source's file."""
     if len(words) != 2 or Path(words[0]).is_file():
-        raise ConfigError("compare: a run, then one file with another trajectory, is wanted", "compare-one-file")
+        raise ConfigError("compare: a run, then one file with another trajectory, is wanted", "compare-runs")
     run, path = read_tables(locate(words[0])), Path(words[1])
     found, tables, text = compare_with_other(run, path)
     folder = output or _default_folder((run,), (path.stem,))
@@ -131,10 +131,10 @@ def _default_folder(runs: tuple[RunTables, ...], others: tuple[str, ...]) -> Pat
 def _write(folder: Path, runs: tuple[RunTables, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
     """Write everything beside the folder and rename; an earlier comparison there is replaced, nothing else."""
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= _FILES):
-        raise GateError(f"{folder}: exists and is no comparison; name another with --output", "folder-exists")
+        raise GateError(f"{folder}: exists and is no comparison; name another with --output", "file-exists")
     place = folder.resolve()
     if any(run.path.resolve().parent in (place, *place.parents) for run in runs):
-        raise GateError(f"{folder}: run folders stay as they were written; name another place", "export-into-run")
+        raise GateError(f"{folder}: run folders stay as they were written; name another place", "file-exists")
     with writing(folder, "name another folder with --output"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in abandoned(folder.parent, folder.name):

@@ -258,12 +258,12 @@ def _read_bands(path: Path) -> pd.DataFrame:
         numbers = table[["time_s", _LOW, _MIDDLE, _HIGH]].astype(float)
     except FileNotFoundError:
         where = "`postflight montecarlo run` and `postflight reconcile` write them"
-        raise GateError(f"{path}: no bands ({_FILE}) here; {where}", "bands-missing") from None
+        raise GateError(f"{path}: no bands ({_FILE}) here; {where}", "file-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{file}: no table of bands: {fault}", "bands-unreadable") from None
+        raise GateError(f"{file}: no table of bands: {fault}", "file-unreadable") from None
     if "quantity" not in table or not len(table):
         words = "name histories in the dispersions file's [outputs] and merge the study again"
-        raise GateError(f"{file}: holds no band of any quantity; {words}", "bands-empty")
+        raise GateError(f"{file}: holds no band of any quantity; {words}", "too-few-data")
     label = table["label"].astype(str) if "label" in table else path.resolve().name
     nominal = table["nominal"].astype(float) if "nominal" in table else np.nan
     return numbers.assign(label=label, quantity=table["quantity"].astype(str), nominal=nominal)
@@ -305,7 +305,7 @@ def _band_panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
         raise GateError(
             f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: none of a "
             f"quantity ({', '.join([*_FLOWN, 'deflection_deg'])}) and time of this flight's pulse",
-            "bands-of-another-flight",
+            "time-not-covered",
         )
     return out
 

@@ -175,7 +175,7 @@ def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible:
     """
     rows = flown[flown["time_s"].between(*_pulse_span(flight))]
     if rows.empty:
-        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="pulse-missing")
+        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="time-not-covered")
     time_s, out = rows["time_s"].to_numpy(), []
     for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
         for quantity, (band, _) in bounds.by_quantity.items():

@@ -159,7 +159,7 @@ class _Entry:
         air = flight.air
         below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
         if not len(below):
-            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="entry-missing")
+            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="time-not-covered")
         self.start_s = float(air.time_s[below[0]])
         pulse_end_s = float(air.time_s[np.flatnonzero(pressure_pulse(air.dynamic_pressure_pa))[-1]])
         span = max(SPAN_S, pulse_end_s - self.start_s)
@@ -207,7 +207,7 @@ class _Entry:
     def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
         if not len(flown.aux):
             message = "pre-flight bounds: a flight has no record; the reconstruction's state at 100 km cannot be flown"
-            raise GateError(message, code="no-record")
+            raise GateError(message, code="too-few-data")
         records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
         tumbling = (records.alpha_total_deg > np.rad2deg(simulate.TUMBLE_RAD)) & (flown.aux[:, 3] > simulate.AIR_PA)
         last = int(np.argmax(tumbling)) if tumbling.any() else len(flown.aux) - 1

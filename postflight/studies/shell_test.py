@@ -92,11 +92,11 @@ def read_load_test(
     angles = [_column(frame, name, ("length", "angle"), arm_m, path, faults) for name in displacements]
     if t is not None and not np.isfinite(t).all():
         row = int(np.argmin(np.isfinite(t)))
-        faults.append(Issue(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "time-missing"))
+        faults.append(Issue(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "column-missing"))
     elif t is not None and np.any(np.diff(t) <= 0.0):
         row = int(np.argmax(np.diff(t) <= 0.0)) + 1
         words = f"{LABEL}: {path}: line {line_of(frame, row)}: time {t[row]:g} s is not after {t[row - 1]:g} s"
-        faults.append(Issue(words, "time-order"))
+        faults.append(Issue(words, "time-backwards"))
     if faults:
         raise GateError(faults)
     assert t is not None
@@ -109,7 +109,7 @@ def read_load_test(
         words = f"{LABEL}: {path}: {len(test.time_s)} rows with load and displacement; {LEAST_ROWS} are needed"
         raise GateError(words, code="too-few-rows")
     if not (np.ptp(test.moment_nm) > 0.0 and test.largest_rad > 0.0):
-        raise GateError(f"{LABEL}: {path}: load and displacement must both change", code="load-constant")
+        raise GateError(f"{LABEL}: {path}: load and displacement must both change", code="too-few-data")
     if np.polyfit(test.moment_nm, test.angle_rad, 1)[0] <= 0.0:
         words = f"{LABEL}: {path}: displacement falls as the load grows; change the sign of one of them"
         raise GateError(words, code="load-sign")
@@ -140,7 +140,7 @@ def _column(
         return values
     if arm_m is None:
         words = f"{LABEL}: {path}: column '{name}' is a {kind}: state its lever arm about the joint with --arm-m"
-        faults.append(Issue(words, "arm-missing"))
+        faults.append(Issue(words, "input-missing"))
         return None
     return values * arm_m if kind == "force" else values / arm_m
 

@@ -54,7 +54,7 @@ def test_a_plane_across_or_opposite_fails(frames, off_deg):
 def test_without_a_plane_or_an_answer_there_is_nothing_to_test(frames):
     read = in_plane(frames, TRUE_DEG)
     assert plane_check(replace(read, plane_lv_rad=None)) is None
-    nothing = refused_fit(no_horizon(Issue("dark", "frame-dark")), Issue("dark", "frame-dark"))
+    nothing = refused_fit(no_horizon(Issue("dark", "frame-exposure")), Issue("dark", "frame-exposure"))
     assert plane_check(replace(read, fits=(nothing,) * 3)) is None
 
 

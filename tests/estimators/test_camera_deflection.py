@@ -289,7 +289,7 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     history = read.history()
     np.testing.assert_array_equal(np.isnan(history.theta_rad), [False] + [True] * 6 + [False])
     codes = {fit.refused.code for fit in read.fits if fit.refused}
-    of_frame = {"frame-dark", "frame-saturated", "frame-size", "frame-undecodable"}
+    of_frame = {"frame-exposure", "frame-size", "frame-undecodable"}
     assert codes == of_frame | {"edge-not-clear", "frame-broken"}
     counts = numbers_in(history.assumptions)
     assert (6.0, 8.0) in itertools.pairwise(counts)
@@ -363,9 +363,9 @@ def test_gates_name_what_is_wrong():
     ahead = MOUNT.model_copy(update={"axis_from_forward_deg": 178.0})
     for times, pictures, mount, code in (
         ([421.0], frames, ahead, "edge-out-of-view"),
-        ([421.0, 422.0], frames, MOUNT, "frame-count"),
-        ([440.0], frames, MOUNT, "benchmark-missing"),
-        ([421.0], [np.zeros_like(frames[0])], MOUNT, "frame-dark"),
+        ([421.0, 422.0], frames, MOUNT, "argument-value"),
+        ([440.0], frames, MOUNT, "time-not-covered"),
+        ([421.0], [np.zeros_like(frames[0])], MOUNT, "frame-exposure"),
     ):
         with pytest.raises(GateError) as refusal:
             read_film(np.array(times), pictures, GEOMETRY, mount, JOINT_M)

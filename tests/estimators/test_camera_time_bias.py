@@ -233,4 +233,4 @@ def test_holes_widen_the_smooth_history_and_long_ones_stay():
     assert not ((got.time_s > 437.1) & (got.time_s < 437.9)).any()
     with pytest.raises(DivergenceError) as refusal:
         smoothed(history_from_lateral(TIME_S[:3], motion(TIME_S[:3]), np.tile(np.eye(2), (3, 1, 1)), "camera", ""))
-    assert refusal.value.codes == ("too-few-readings",)
+    assert refusal.value.codes == ("too-few-data",)

@@ -255,7 +255,7 @@ def test_check_tries_the_benchmark_frame():
     (remark,) = benchmark_frame(found(picture, "drawn"))
     assert remark.code == "features-not-found"
     (remark,) = benchmark_frame(found(np.zeros((480, 720), dtype=np.uint8), "texture"))
-    assert remark.code == "frame-dark"
+    assert remark.code == "frame-exposure"
     text = np.zeros(picture.shape, dtype=bool)
     text[20:60, 40:400] = True
     assert text_in_films(found(picture, "texture")) == []
@@ -318,7 +318,7 @@ def test_a_picture_with_oblong_pixels_is_refused():
 
 
 @pytest.mark.parametrize(("code", "refused", "left"), [
-    ("edge-too-short", 11, 0), ("edge-too-short", 10, 10), ("frame-dark", 15, 5),
+    ("edge-too-short", 11, 0), ("edge-too-short", 10, 10), ("frame-exposure", 15, 5),
 ])  # fmt: skip
 def test_a_film_of_which_most_frames_show_no_shell_has_no_answer(code, refused, left):
     fits = answers(np.full(20, 2.0))

@@ -178,7 +178,7 @@ def test_frames_of_one_load_tell_nothing():
     assert refusal.value.codes == ("loads-alike",)
     with pytest.raises(GateError) as refusal:
         shell_shape([LoadedFilm(film.film, np.where(np.arange(len(TIME_S)) < 5, PRESSURE_PA, np.nan))])
-    assert refusal.value.codes == ("too-few-frames",)
+    assert refusal.value.codes == ("too-few-data",)
 
 
 def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():

@@ -249,7 +249,7 @@ def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
     assert codes(4, 6) == [5]
     assert codes(7, 8) == [6, 9]
     assert codes(4, 6, code="shell-little-seen") == [5]
-    assert codes(4, 6, code="frame-dark") == []
+    assert codes(4, 6, code="frame-exposure") == []
 
 
 def test_part_of_an_edge_beside_hardly_a_feature_is_no_answer(frames):

@@ -93,14 +93,14 @@ def test_inverse_look_up(table):
 
 def test_outside_the_table_is_refused(table):
     for mach, alpha in ((3.0, -0.1), (3.0, 3.2), (np.nan, 0.1)):
-        with refuses("aero-range", kind=TableRangeError):
+        with refuses("table-range", kind=TableRangeError):
             table.at(mach, alpha)
 
 
 @pytest.mark.parametrize(
     ("text", "code", "name"),
     [
-        ("mach,alpha_deg,ca,cn,cm\n1,0,1,0,0\n", "aero-column-missing", "cmq"),
+        ("mach,alpha_deg,ca,cn,cm\n1,0,1,0,0\n", "column-missing", "cmq"),
         ("mach,alpha_deg,ca,cn,cm,cmq\n1,0,1,0,0,0\n1,5,1,x,0,0\n2,0,1,0,0,0\n2,5,1,0,0,0\n", "not-a-number", "line 3"),
         ("mach,alpha_deg,ca,cn,cm,cmq\n1,0,1,0,0,0\n1,5,1,0,0,0\n2,0,1,0,0,0\n", "aero-grid", "3 rows"),
         (

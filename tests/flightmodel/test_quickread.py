@@ -158,7 +158,7 @@ def test_an_open_quote_is_refused_with_its_line(tmp_path):
     path = tmp_path / "t.csv"
     for rows in (["1,2", '3,"4', "5,6"], ["1,2", '3,"4'], ["1,2", '3,"4', '5",6']):
         path.write_text("\n".join(["a,b", *rows]))
-        with refuses("table-quote", names=["line 3"]):
+        with refuses("row-ragged", names=["line 3"]):
             read_table(path, "label")
         assert read_numbers(path, {"a": True}) is None
 

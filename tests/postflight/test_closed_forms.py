@@ -520,7 +520,7 @@ def test_what_stands_still_and_reads_one_is_in_g(monkeypatch):
         findings = inertial.at_rest(found)
         assert len(findings) == count
         if count:
-            assert findings[0].code == "accelerometer-unit"
+            assert findings[0].code == "unit-suspect"
             assert findings[0].what.endswith("'g'")
 
 

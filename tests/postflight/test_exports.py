@@ -196,7 +196,7 @@ def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError) as fault:
         exports.export(folder, "parquet", None)
-    assert fault.value.codes == ("library-missing",)
+    assert fault.value.codes == ("package-missing",)
     assert "postflight[parquet]" in str(fault.value)
     assert fault.value.exit_code == 2
     assert not (folder / "exports").exists()
@@ -211,7 +211,7 @@ def test_flight_without_a_run_is_refused(tmp_path):
 def test_run_folders_stay_as_they_are(folder):
     with pytest.raises(ConfigError) as fault:
         exports.export(folder, "csv", folder / "runs" / "x.csv")
-    assert fault.value.codes == ("export-into-run",)
+    assert fault.value.codes == ("file-exists",)
 
 
 def test_summary_says_on_what_the_position_rests(folder):

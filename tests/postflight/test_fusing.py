@@ -82,7 +82,7 @@ def test_a_film_that_is_early_by_most_of_a_period_has_its_time_bias():
 def test_a_time_bias_is_found_without_the_trim_where_all_methods_have_no_answer(monkeypatch):
     def diverging(read, **kwargs):
         if any(e.method == "trim" for e in read({}, None)):
-            raise DivergenceError("it still moves", code="fusion-not-converged")
+            raise DivergenceError("it still moves", code="not-converged")
         return fuse(read, **kwargs)
 
     monkeypatch.setattr(fusing, "fuse", diverging)
@@ -173,7 +173,7 @@ def test_quantiles_between_frames_are_as_wide_as_the_sd():
 
 
 def test_a_refused_fusion_is_a_red_check():
-    refused = Deflections(refused={"fused": Issue("no common answer", "fusion-not-converged")})
+    refused = Deflections(refused={"fused": Issue("no common answer", "not-converged")})
     (check,) = refused.consistency_checks
     assert not check.passed
     assert check.code == "deflection-methods"

@@ -306,7 +306,7 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0, by_s
         ({"cost": 1.3 * 597.0}, "joint-residuals"),
         ({"vehicle": 1.1 * MOST_MOVED_SD}, "joint-moves"),
         ({"spans": 12.0}, "joint-spans"),
-        ({"converged": False}, "joint-converged"),
+        ({"converged": False}, "not-converged"),
         ({"by_steps": 0.6}, "joint-steps"),
         ({"creep": 4.5}, "joint-creep"),
     ],

@@ -24,7 +24,7 @@ def test_rows_outside_are_left_out(flight, clean_flight, section):
     np.testing.assert_array_equal(record.time_s, before.time_s[inside])
     if section == "frames":
         assert [p.name for p in record.paths] == [p.name for p, kept in zip(before.paths, inside, strict=True) if kept]
-    (told,) = [f.what for f in telemetry.findings if (f.source, f.code) == (name, "rows-outside-span")]
+    (told,) = [f.what for f in telemetry.findings if (f.source, f.code) == (name, "rows-left-out")]
     assert numbers_in(told)[:2] == [(~inside).sum(), len(inside)]
 
 
@@ -38,5 +38,5 @@ def test_a_picture_outside_may_be_missing(flight):
 
 def test_a_span_without_a_picture_is_refused(flight):
     flight.declare("use_s = [[500.0, 600.0]]", after="[frames]")
-    with refuses("use-span-empty", names=["use_s"]):
+    with refuses("too-few-rows", names=["use_s"]):
         read_flight(flight.root)

@@ -165,7 +165,7 @@ def test_a_locked_joint_carries_the_force_of_the_rigid_body():
 
 
 def test_an_unknown_vehicle_is_refused(tmp_path):
-    with refuses("vehicle-unknown", names=["'irve'"], kind=ConfigError):
+    with refuses("name-unknown", names=["'irve'"], kind=ConfigError):
         commands.stiffness_and_damping("irve", tmp_path)
 
 

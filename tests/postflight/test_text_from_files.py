@@ -58,7 +58,7 @@ def test_names_of_columns_and_files_do_not_reach_the_terminal_raw(flight, comman
     flight.header("rates.csv", "q_body_degps", f"q{ESCAPE}{BIDI}")
     done = command(verb, flight.root)
     assert done.returncode in (2, 3)
-    assert "table-column-missing" in printed_codes(done.stdout + done.stderr)
+    assert "column-missing" in printed_codes(done.stdout + done.stderr)
     assert not set(done.stdout + done.stderr) & set("\x1b\x07\u202e\u2066")
 
 

@@ -167,7 +167,7 @@ def test_attitude_and_air_come_last():
 def test_the_vehicle_comes_before_the_air_where_its_drag_is_farther_off():
     checks = (
         replace(failed("sounding-density", symptom="density"), value=5.0, high=4.0),
-        replace(failed("pre-flight-ca"), value=9.0, high=3.0),
+        replace(failed("pre-flight-drag"), value=9.0, high=3.0),
     )
     found = isolate_faults(checks, ())
     assert [h.sources for h in found] == [("vehicle", "atmosphere"), ("atmosphere", "vehicle")]
