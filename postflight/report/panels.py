@@ -206,7 +206,6 @@ def residual_panels(run: Run) -> list[Panel]:
 
 _FILE = "bands.csv"
 _LOW, _MIDDLE, _HIGH = BAND_COLUMNS
-_G = earth.STANDARD_GRAVITY_MPS2
 _COLOURS = (_GREY, COLOUR["second"], COLOUR["corrected"], _DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
 _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
@@ -214,9 +213,9 @@ _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "normal_g": (
         "Normal acceleration at the c.g.",
         "g",
-        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / _G,
+        lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
     ),
-    "axial_g": ("Axial deceleration at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / _G),
+    "axial_g": ("Axial deceleration at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2),
     "rate_degps": ("Lateral rate", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),
