@@ -558,7 +558,7 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
         if left:
             spans = ", ".join(f"{start:g} to {stop:g} s" for start, stop in source.use_s)
             words = f"{left} of {int(use.sum())} rows lie outside use_s ({spans}) and are left out"
-            findings.append(Issue(words, "rows-left-out", name))
+            findings.append(Issue(words, "rows-outside-span", name))
         use &= inside
     return use, findings
 

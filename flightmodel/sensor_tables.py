@@ -263,7 +263,7 @@ def _note_geoid(gate: Gate, name: str, source: Heights, undulation_m: FloatArray
         low, high = np.nanmin(undulation_m), np.nanmax(undulation_m)
         size = f"{low:.1f} m" if high - low < 0.1 else f"{low:.1f} to {high:.1f} m"
         words = f"heights above mean sea level became ellipsoidal with EGM96's undulation, {size}"
-        gate.findings.append(Issue(words, "converted", name))
+        gate.findings.append(Issue(words, "values-converted", name))
 
 
 def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
@@ -345,7 +345,7 @@ def read_barometer(
             words += (
                 "; near and above the speed of sound a port does not measure static pressure: use_s can leave that out"
             )
-        gate.findings.append(Issue(words, "converted", name))
+        gate.findings.append(Issue(words, "values-converted", name))
     else:
         height = table.columns["height"]
     undulation = source.to_ellipsoid_m(*place)
@@ -717,7 +717,7 @@ def _winds(gate: Gate, table: Table, planet: earth.Planet) -> tuple[FloatArray, 
         return c["wind_north"], c["wind_east"]
     if {"wind_speed", "wind_from"} <= set(c):
         words = "wind is given by where it comes from: converted to the velocity of the air mass"
-        gate.findings.append(Issue(words, "converted", SOURCE))
+        gate.findings.append(Issue(words, "values-converted", SOURCE))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
     if planet != earth.WGS84 and not {"wind_north", "wind_east", "wind_speed", "wind_from"} & set(c):
         still = np.zeros(len(table.lines))  # no wind is known there but by models

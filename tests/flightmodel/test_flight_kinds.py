@@ -114,7 +114,7 @@ def test_where_no_undulation_is_stated_the_model_gives_it(folder):
     np.testing.assert_allclose(up, np.tile([0.0, 0.0, -expected], (len(T), 1)), atol=1e-3)
     raised = after.barometers["baro"].height_m - before.barometers["baro"].height_m
     np.testing.assert_allclose(raised, expected, atol=1e-3)
-    assert [f.source for f in after.findings if f.code == "converted"] == ["gps", "baro"]
+    assert [f.source for f in after.findings if f.code == "values-converted"] == ["gps", "baro"]
 
 
 def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(folder):
@@ -232,7 +232,7 @@ def test_barometer_by_height_and_by_pressure(folder):
     folder.table("baro.csv", "t_s,pressure_pa", T, us76(true)[2])
     telemetry = folder.read(GNSS, BARO, BALLISTIC)
     np.testing.assert_allclose(telemetry.barometers["baro"].height_m, true, atol=0.01)
-    assert "use_s" in findings(telemetry, "baro")["converted"]
+    assert "use_s" in findings(telemetry, "baro")["values-converted"]
 
 
 def test_pressure_height_follows_the_days_air():
@@ -326,7 +326,7 @@ def test_use_s_and_offset_and_repeats(folder):
     np.testing.assert_allclose(record.height_m, 1400 + 10 * inside)
     told = findings(telemetry, "baro")
     assert numbers_in(told["rows-left-out"]) == [4.0]
-    assert numbers_in(told["rows-left-out"]) == [26.0, 40.0, 2.0, 6.0, 10.0, 12.0]
+    assert numbers_in(told["rows-outside-span"]) == [26.0, 40.0, 2.0, 6.0, 10.0, 12.0]
 
 
 def test_samples_outside_use_s_may_be_wild(folder):

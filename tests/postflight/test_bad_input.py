@@ -626,7 +626,7 @@ def test_wind_from_is_said_to_have_been_turned(flight) -> None:
     rows = [row.split(",")[:3] for row in flight.lines("atmosphere.csv")[1:]]
     header = "alt_m,rho_kgpm3,t_k,wind_speed_mps,wind_from_deg"
     flight.write_lines("atmosphere.csv", [header, *(",".join([*r, "10.0", "270"]) for r in rows)])
-    assert findings_of(flight, "atmosphere", "converted")
+    assert findings_of(flight, "atmosphere", "values-converted")
 
 
 def test_pressure_that_contradicts_density_and_temperature_is_told(flight) -> None:

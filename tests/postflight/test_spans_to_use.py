@@ -24,7 +24,7 @@ def test_rows_outside_are_left_out(flight, clean_flight, section):
     np.testing.assert_array_equal(record.time_s, before.time_s[inside])
     if section == "frames":
         assert [p.name for p in record.paths] == [p.name for p, kept in zip(before.paths, inside, strict=True) if kept]
-    (told,) = [f.what for f in telemetry.findings if (f.source, f.code) == (name, "rows-left-out")]
+    (told,) = [f.what for f in telemetry.findings if (f.source, f.code) == (name, "rows-outside-span")]
     assert numbers_in(told)[:2] == [(~inside).sum(), len(inside)]
 
 
