@@ -29,7 +29,7 @@ from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
 from postflight.flight import NO_VIDEO, Flight
-from postflight.fusing import CAMERA_PLANE_SD_RAD
+from postflight.fusing import CAMERA_PLANE_SD_RAD, CameraTimeBias, time_bias_if_free
 from postflight.reconstruction import Reconstruction
 from recon.consistency import ConsistencyCheck
 
@@ -229,6 +229,16 @@ def camera_answer(
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "plane-assumed")
     return _of_several(flight, bet, progress)
+
+
+def answer_of_film(bet: Reconstruction, film: FilmFit) -> CameraAnswer:
+    """`camera_answer` of a flight whose film is read."""
+    return camera_answer(bet.flight, bet, film=film)
+
+
+def time_bias_of(bet: Reconstruction, camera: CameraAnswer) -> CameraTimeBias | None:
+    """`time_bias_if_free` of a trajectory and a camera's answer."""
+    return time_bias_if_free(bet.required_loads(), camera.plain)
 
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
