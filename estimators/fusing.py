@@ -14,7 +14,6 @@ each method, or a posterior in which the likeliest fault's inputs are as good as
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,7 +37,7 @@ from estimators.loads import MIN_AXIAL_MPS2, FlightLoads
 from estimators.misalignment import estimate_misalignment, misalignment_evidence
 from estimators.southwell import Limbs, southwell_limbs
 from estimators.trim import estimate_trim, trim_evidence
-from flightmodel.checks import Check, DivergenceError, FloatArray, GateError
+from flightmodel.checks import Check, DivergenceError, FloatArray, GateError, Result
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 
 _METHODS: dict[str, Method] = {"misalignment": misalignment_evidence, "trim": trim_evidence}
@@ -180,7 +179,7 @@ def fuse_flight(
     loads: FlightLoads,
     camera: DeflectionHistory | None,
     camera_time_bias_sd_s: float = 0.0,
-    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
+    time_bias: Result[CameraTimeBias | None] | None = None,
 ) -> FusedAnswer:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
 
@@ -194,6 +193,8 @@ def fuse_flight(
     camera : DeflectionHistory or None
         With the benchmark frame taken as undeflected.
     camera_time_bias_sd_s : float
+    time_bias : Result, optional
+        `time_bias_if_free` of the same flight, where it is worked out elsewhere meanwhile.
 
     Raises
     ------
@@ -215,8 +216,9 @@ def fuse_flight(
     is_tested = observable and bias_sd_s == 0.0
 
     def bias() -> CameraTimeBias | None:
-        known = tested() if is_tested else (None,)
-        return _tested_time_bias(sources) if known is None else known[0]
+        if not is_tested:
+            return None
+        return _tested_time_bias(sources) if time_bias is None else time_bias.result()
 
     try:
         answer = sources.answer(sources.names, bias_sd_s)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from math import isfinite, nan
 from numbers import Integral
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,17 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Progress = Callable[[float, str], None]  # fraction done, and what is being done
+
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Result(Protocol[T_co]):
+    """What has, or will have, a result: a `concurrent.futures.Future`, or work in another process."""
+
+    def result(self) -> T_co:
+        """Wait for it."""
+        ...
 
 
 def part_of(report: Progress, first: float, last: float) -> Progress:

@@ -7,8 +7,6 @@ The commands ``postflight montecarlo`` and ``postflight study``: many flights at
 from __future__ import annotations
 
 import _thread
-import atexit
-import gc
 import os
 import signal
 import sys
@@ -23,28 +21,23 @@ from typing import Any, Literal, NamedTuple
 
 import click
 
-from postflight.streams import close_streams, leave_arrow_out, open_streams, pin_threads, write_out
+from postflight.streams import close_streams, open_streams, pin_threads, write_out
 
-# heavy imports stand inside the commands, so that --help answers at once; they make hundred thousands of objects, in
-# which five hundred searches for garbage find none: an eighth of the time of loading, here and in the second process
-gc.set_threshold(50_000, 20, 100)
-# at its end the interpreter would search them all once more, for 0.4 s
-atexit.register(gc.freeze)
+# heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
 
 
 class Computing(click.Command):
-    """A command that loads pandas; its help does not."""
+    """A command that knows when it began."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Load pandas without Arrow, then run the command; its ``obj`` is when that began."""
+        """Run the command; its ``obj`` is when that began."""
         ctx.obj = time.perf_counter()
-        leave_arrow_out()
         return super().invoke(ctx)
 
 
 class Commands(click.Group):
-    """Commands, all of which load pandas."""
+    """Commands of this kind."""
 
     command_class = Computing
 

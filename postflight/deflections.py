@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, check_type, part_of
+from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
@@ -278,14 +278,13 @@ def estimate(
     flown: Flight | Reconstruction,
     methods: tuple[str, ...],
     progress: Progress | None = None,
-    seen: Callable[[], CameraAnswer | None] = lambda: None,
-    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
+    camera: Result[CameraAnswer] | None = None,
+    time_bias: Result[CameraTimeBias | None] | None = None,
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone. What ``seen`` returns is taken for the camera's
-    answer, and waited for while other methods run; without it the film is read. ``tested``: the same of the test of the
-    camera's time bias.
+    A `Flight` without a trajectory has an answer of the camera alone. The result of ``camera`` is the camera's answer,
+    where it is worked out elsewhere meanwhile, and that of ``time_bias`` the test of the camera's time bias.
     """
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
@@ -297,7 +296,8 @@ def estimate(
             if method == "camera":
                 from postflight.filming import camera_answer, keep_oriented
 
-                filmed = seen() or camera_answer(flight, bet, part_of(report, k / len(methods), (k + 1) / len(methods)))
+                shown = part_of(report, k / len(methods), (k + 1) / len(methods))
+                filmed = camera_answer(flight, bet, shown) if camera is None else camera.result()
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None:
@@ -311,12 +311,10 @@ def estimate(
 
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
-                camera = filmed.plain if filmed is not None and used else None
-                if camera is None and "camera" not in answers.refused:
-                    camera = camera_for_fusion(flight)
-                fused = fuse_flight(
-                    bet.required_loads(), camera, _time_bias_sd_s(flight), tested if used else lambda: None
-                )
+                own = filmed.plain if filmed is not None and used else None
+                if own is None and "camera" not in answers.refused:
+                    own = camera_for_fusion(flight)
+                fused = fuse_flight(bet.required_loads(), own, _time_bias_sd_s(flight), time_bias if used else None)
                 history = fused.history
         except GateError as fault:
             answers.refused[method] = Issue(str(fault), fault.codes[0])
@@ -394,8 +392,10 @@ def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> Defl
     """Fused deflection alone, without a test of the camera's time bias; None where there is none."""
     from estimators.fusing import fuse_flight
 
+    untested: Future[CameraTimeBias | None] = Future()
+    untested.set_result(None)
     try:
-        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), lambda: (None,))
+        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested)
     except GateError:
         return None
     found = answer.history

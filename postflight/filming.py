@@ -19,7 +19,7 @@ from estimators.camera import FilmFit, JointSwing, read_film
 from estimators.camera_fit import OrientedCamera
 from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
 from estimators.frame_edits import edited
-from estimators.fusing import CAMERA_PLANE_SD_RAD
+from estimators.fusing import CAMERA_PLANE_SD_RAD, CameraTimeBias, time_bias_if_free
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
 from estimators.unloaded_frames import rest_check
@@ -189,6 +189,16 @@ def camera_answer(
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "keys-conflict")
     return _of_several(flight, bet, progress)
+
+
+def answer_of_film(bet: Reconstruction, film: FilmFit) -> CameraAnswer:
+    """`camera_answer` of a flight whose film is read."""
+    return camera_answer(bet.flight, bet, film=film)
+
+
+def time_bias_of(bet: Reconstruction, camera: CameraAnswer) -> CameraTimeBias | None:
+    """`time_bias_if_free` of a trajectory and a camera's answer."""
+    return time_bias_if_free(bet.required_loads(), camera.plain)
 
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:

@@ -24,6 +24,7 @@ from flightmodel.statistics import chi_square_quantile
 from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle
 from postflight import run_folder
+from postflight.beside import Beside, same
 from postflight.commands import compile_kernels, console, print_checks
 from postflight.deflections import camera_for_fusion
 from postflight.flight import RECONSTRUCT, Flight
@@ -45,8 +46,7 @@ from postflight.reconciliation.posterior import (
     vehicle_file_lines,
 )
 from postflight.reconstruction import Reconstruction, reconstruct
-from postflight.second_process import SecondProcess
-from postflight.streams import keep_arrays, on_one_thread
+from postflight.streams import on_one_thread
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
@@ -150,17 +150,17 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled}
     if sampled:
         require_sampler()
-    keep_arrays()
-    with SecondProcess() as second, progress_bar() as report:
-        report(0.0, "reading telemetry")
-        telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
-        require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
-        require_damping(telemetry.required_vehicle())
-        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
+    with progress_bar() as report:
+        telemetry = read_flight(folder, lambda f: report(f, "reading telemetry"))
+    require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
+    require_damping(telemetry.required_vehicle())
+    compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
+    with Beside() as beside, progress_bar() as report:
         measured = Flight(telemetry)
-        second.ask(camera_for_fusion, measured)
+        camera = beside.keep(camera_for_fusion, measured)
         flight = reconstruct(measured, progress=lambda f, what: report(0.02 + 0.18 * f, what))
-        second.ask(without_fit, flight, second.answer())
+        kept = beside.keep(same, flight)
+        no_fit = beside.submit(without_fit, kept, camera)
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds
@@ -169,14 +169,14 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             posterior = sample(fit, lambda f, what: report(0.6 + 0.3 * f, what))
         report(0.9, "flying entries with the fitted joint")
         laws_flown, vehicle = dispersed(fit)
-        second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
+        with_fit = beside.submit(entry_bounds, kept, laws_flown, ENTRIES, 0, None, vehicle)
         # a third of a second to import, while the other process flies
         from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
         from postflight.plots.style import draw
         from postflight.studies.commands import bands, compared_with_bounds
 
         modal, no_modes = _modes(flight, fit)
-        fused, rigid = second.answer()
+        fused, rigid = no_fit.result()
         settings["output_rate_hz"] = flight.flight.settings.output_rate_hz
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(fit)
@@ -199,7 +199,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             if posterior is not None:
                 draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
             draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
-            flexible = second.answer()
+            flexible = with_fit.result()
             shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)

@@ -1,5 +1,6 @@
 """Camera time bias against the gyros', and the camera's history smoothed in time: planted biases, errors as stated."""
 
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -134,9 +135,10 @@ def test_a_time_bias_stated_as_zero_is_tested_but_not_applied():
     assert not CameraTimeBias(0.01, 0.01, False).is_off
     # tested elsewhere meanwhile it is the same, and what comes from there is taken
     assert time_bias_if_free(loads, readings) == trusted.camera_time_bias
-    other = CameraTimeBias(0.5, 0.1, False)
-    assert fuse_flight(loads, readings, tested=lambda: (other,)).camera_time_bias == other
-    assert fuse_flight(loads, None, tested=lambda: (other,)).camera_time_bias is None
+    other, found = CameraTimeBias(0.5, 0.1, False), Future()
+    found.set_result(other)
+    assert fuse_flight(loads, readings, time_bias=found).camera_time_bias == other
+    assert fuse_flight(loads, None, time_bias=found).camera_time_bias is None
 
 
 def test_late_triads_are_set_right():

@@ -62,7 +62,7 @@ def test_nowhere_to_write_at_all(tmp_path):
 
     Only drawing then fails: matplotlib insists on a folder.
     """
-    refused = "import tempfile\ndef no(**_): raise OSError(30, 'read-only')\ntempfile.mkdtemp = no\n"
+    refused = "import tempfile\ndef no(*_, **__): raise OSError(30, 'read-only')\ntempfile.mkdtemp = no\n"
     (tmp_path / "file").touch()
     code = refused + USE.replace("postflight.plots.deflection, postflight.commands as", "postflight.warmup as")
     code = code.replace("commands.compile_kernels()\n", "commands.prepare((), print)\n")
