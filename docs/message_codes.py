@@ -28,7 +28,7 @@ CALLS = {
 NO_CODES = {
     "utf-8", "utf-8-sig", "utf-16", "latin-1", "no-referrer", "no-store", "same-origin", "retry-failed",
     "shell-test", "demo-flight", "study-damping", "study-stiffness", "study-preflight", "study-shell-test",
-    "milli-g", "non-orthogonality", "wind-relative", "time-offset", "track-rotation", "attitude-body",
+    "non-orthogonality", "wind-relative", "time-offset", "track-rotation", "attitude-body",
     "attitude-earth", "inertial-velocity", "other-point",
 }  # fmt: skip
 Known = dict[str, ast.expr]
