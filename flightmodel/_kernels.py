@@ -2,8 +2,9 @@
 
 Readable twins: `flightmodel.earth`, `flightmodel.rotations`. Importing this module also points numba's cache at a
 folder whose name carries a hash of the processor and of every module that imports this one: numba does not notice a
-change in a callee of another file, so a stale cache must not be reachable. Where the user's cache cannot be written, as in a container
-with a read-only file system, the folder is a temporary one of this process: that costs time, never the command.
+change in a callee of another file, so a stale cache must not be reachable. Where the user's cache cannot be written,
+as in a container with a read-only file system, the folder is a temporary one of this process: that costs time, never
+the command.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from numba.core.registry import CPUDispatcher
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 # a module that may hold kernels: it imports this one
-HOLDS_KERNELS = re.compile(rb"^from flightmodel(\._kernels import | import ([^\n]*\b|\([^)]*\b))_kernels\b)", re.MULTILINE)
+HOLDS_KERNELS = re.compile(rb"^from flightmodel(\._kernels import| import ([^\n]*|\([^)]*)\b_kernels\b)", re.MULTILINE)
 REMEDY = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that may be written"
 
 
