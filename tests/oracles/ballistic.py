@@ -3,8 +3,7 @@
 import numpy as np
 
 from flightmodel import earth, rotations
-from recon.propagation import MOST_CHANGE, MOST_PARTS
-from recon.propagation import Step
+from recon.propagation import MOST_CHANGE, MOST_PARTS, Step
 from recon.state import States
 
 
