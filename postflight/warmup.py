@@ -40,12 +40,12 @@ def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
 
 
 def _simulator() -> None:
-    from synthetic_flight._kernels import gauss_markov
+    from synthetic_flight.instrument_errors import unit_gauss_markov
     from synthetic_flight.simulate import integrate, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
-    gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
+    unit_gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
 
 
 def _fly_ensemble(creep: int) -> None:
@@ -63,7 +63,7 @@ def _ensembles() -> None:
 
 def _creep() -> None:
     """Of what a joint that creeps adds a reconciliation asks in every flight."""
-    from synthetic_flight._kernels import CREEP_STATES
+    from synthetic_flight.dynamics import CREEP_STATES
 
     _fly_ensemble(CREEP_STATES)
 
@@ -127,14 +127,15 @@ def _balance() -> None:
 
 
 def _spans() -> None:
-    from postflight.reconciliation import _span_kernels as kernels
+    from postflight.reconciliation.forward_model import sense
+    from postflight.reconciliation.normal_equations import add_part
 
     records, number, three = np.zeros((1, 3, 22)), np.zeros(1, dtype=np.int64), np.zeros((1, 3))
     windows, slope = np.empty((2, 1, 1, 6))
     aux, simpson = np.zeros((1, 3, 18)), np.ones(3)
-    kernels.sense(records, aux, number, three, np.ones(1), simpson, 1.0, windows, slope)
+    sense(records, aux, number, three, np.ones(1), simpson, 1.0, windows, slope)
     one = np.zeros((1, 1))
-    kernels.add_part(one, one, one, number, one)
+    add_part(one, one, one, number, one)
 
 
 def _camera() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from synthetic_flight import _film_kernels, _kernels, dynamics, film, simulate
+from synthetic_flight import dynamics, film, instrument_errors, simulate
 from synthetic_flight.simulate import integrate
 from tests.oracles import plain_film, two_body
 
@@ -86,12 +86,12 @@ def test_a_step_is_runge_and_kutta_s_of_fourth_order(generic_vehicle):
 def test_dead_band_is_that_of_the_readable_form():
     freeplay, corner = np.deg2rad(0.4), 0.1
     for theta in np.deg2rad(np.linspace(0.0, 1.0, 41)):
-        got = _kernels.beyond_freeplay(theta, *simulate.freeplay_corner(freeplay, corner))
-        assert got == pytest.approx(float(dynamics.beyond_freeplay(theta, freeplay, corner)), abs=1e-17)
+        got = dynamics.beyond_freeplay(theta, *simulate.freeplay_corner(freeplay, corner))
+        assert got == pytest.approx(float(dynamics.angle_beyond_freeplay(theta, freeplay, corner)), abs=1e-17)
     # the integral from rest to beyond is that of the sharp corner but for what the rounding gives away: half^2 / 12...
     half = corner * freeplay
     grid = np.linspace(freeplay - half, freeplay + half, 4001)
-    area = np.trapezoid([_kernels.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in grid], grid)
+    area = np.trapezoid([dynamics.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in grid], grid)
     assert area == pytest.approx((2.0 * half) ** 3 / (12.0 * half), rel=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_gauss_markov_noise_is_stationary_row_by_row():
     for row in range(4):
         white, out = np.zeros((4, 1)), np.empty((4, 1))
         white[row] = 1.0
-        _kernels.gauss_markov(keep, white, out)
+        instrument_errors.unit_gauss_markov(keep, white, out)
         weight[:, row] = out[:, 0]
     covariance = weight @ weight.T
     np.testing.assert_allclose(np.diag(covariance), 1.0, rtol=1e-14)
@@ -143,9 +143,9 @@ def seen_along(rays, eye, light, shell_and_warp, body, painted, shadows):
     """Depth and radiance (h, w) of a shell in body axes that rays (h, w, 3) meet."""
     depth, shade = np.empty((2, *rays.shape[:2]))
     free, flat = np.full(depth.size, np.nan if shadows else 1.0), rays.reshape(-1, 3)
-    _film_kernels.cast(rays, np.ones(depth.shape, dtype=bool), np.eye(3), eye, *shell_and_warp, depth)
-    _film_kernels.see_sun(flat, depth.ravel(), np.eye(3), eye, light, *shell_and_warp, body, free)
-    _film_kernels.shade_shell(flat, depth.ravel(), free, np.eye(3), eye, light, *shell_and_warp, painted, shade.ravel())
+    film.cast(rays, np.ones(depth.shape, dtype=bool), np.eye(3), eye, *shell_and_warp, depth)
+    film.see_sun(flat, depth.ravel(), np.eye(3), eye, light, *shell_and_warp, body, free)
+    film.shade_shell(flat, depth.ravel(), free, np.eye(3), eye, light, *shell_and_warp, painted, shade.ravel())
     return depth, shade
 
 
@@ -169,7 +169,7 @@ def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
     np.testing.assert_allclose(depth[met], t.reshape(8, 5)[met], atol=2e-3)
     np.testing.assert_allclose(shade[met], stack.shade(plain, t, light).reshape(8, 5)[met], atol=0.01)
     near, closest = np.empty((2, 40))
-    _film_kernels.closest(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, shell, warp, near, closest)
+    film.closest(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, shell, warp, near, closest)
     want, far = stack.closest(plain, t)
     np.testing.assert_allclose(near, far, atol=1e-4)
     np.testing.assert_allclose(closest, want, atol=2e-3)
@@ -185,12 +185,12 @@ def test_the_way_to_the_stack_meets_nothing_before_it(generic_vehicle):
     r, clock, out = rng.uniform(0.4, 1.3, 30), rng.uniform(0.0, 2.0 * np.pi, 30), rng.uniform(0.12, 0.3, 30)
     station = stack.s0 + ((r - stack.r0) * stack.cos + out) / stack.sin
     points = np.column_stack([-station, -r * np.cos(clock), r * np.sin(clock)])
-    _film_kernels.sunlit(points, light, film.shell_terms(geometry), film.warp_terms(None), share)
+    film.sunlit(points, light, film.shell_terms(geometry), film.warp_terms(None), share)
     ways = np.linspace(0.0, 4.0, 4001)
     for point, seen in zip(points, share, strict=True):
         along = (point + ways[:, None] * light).T
         gap = stack.gap(plain_film.Rays(along.astype(np.float32), np.zeros(3)), np.float32(1.0))
-        free = np.min(gap[1:] / (_film_kernels.SUN_DIAMETER * ways[1:]))
+        free = np.min(gap[1:] / (film.SUN_DIAMETER * ways[1:]))
         assert seen == pytest.approx(np.clip(free, 0.0, 1.0), abs=0.05)
     assert 0.2 < np.mean(share > 0.5) < 0.8
 
