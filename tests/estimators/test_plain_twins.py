@@ -24,9 +24,9 @@ from estimators.edge import (
 )
 from estimators.frame_residuals import waves_round
 from estimators.virtual_camera import VirtualCamera
-from flightmodel import _raster_kernels
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_clock, lv_direction
+from flightmodel.rendering import fill
 from tests.oracles import plain_fit, plain_horizon, plain_sight
 
 from .conftest import VEHICLE
@@ -498,7 +498,7 @@ def test_large_residuals_pull_no_harder_than_huber_lets_them():
 def test_distances_are_linear_between_a_triangle_s_corners():
     depth, nearest = np.full((20, 30), np.inf), np.full((20, 30), -1)
     corners, away = np.array([[3.0, 2.0], [25.0, 4.0], [8.0, 17.0]]), [5.0, 9.0, 14.0]
-    _raster_kernels.fill(*corners.ravel(), *away, 4, depth, nearest)
+    fill(*corners.ravel(), *away, 4, depth, nearest)
     hit = nearest == 4
     plane = np.linalg.solve(np.column_stack([corners, np.ones(3)]), away)
     v, u = np.indices(depth.shape)
