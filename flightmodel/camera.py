@@ -98,10 +98,7 @@ class Camera:
 
     @cached_property
     def lens_terms(self) -> tuple[int, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """What a compiled projection wants: model, half field, focal lengths, principal point, coefficients (5), position
-
-        and axes of the camera.
-        """
+        """What compiled projections want: model, half field, focal, centre, coefficients (5), position and axes."""
         axes, model = np.ascontiguousarray(self.dcm_cam_body), LENSES.index(self.lens)
         coefficients = _five(self.distortion)
         return model, self.half_field_rad, self.focal_px, self.centre_px, coefficients, self.position_body_m, axes
