@@ -8,12 +8,11 @@ import math
 
 import numpy as np
 
-from estimators._sight_kernels import pixel_of
 from flightmodel._kernels import inlined, kernel
 
 
 @inlined
-def _grey_inside(image, u, v):
+def grey_inside(image, u, v):
     """Grey level between pixels, bilinear, of a place that lies in the picture."""
     j, i = int(u), int(v)
     a, b = u - j, v - i
@@ -25,7 +24,7 @@ def _grey_inside(image, u, v):
 def _grey_at(image, u, v):
     """Grey level between pixels, bilinear; the border's beyond the picture."""
     h, w = image.shape
-    return _grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
+    return grey_inside(image, min(max(u, 0.0), w - 1.000001), min(max(v, 0.0), h - 1.000001))
 
 
 @inlined
@@ -271,135 +270,6 @@ def good_steps(lines, steps, noise, weights, beside, floor, found):
             sd[count], line[count] = math.sqrt(variance + floor * floor), index[i]
             count += 1
     return count
-
-
-@inlined
-def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset, sd):
-    """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
-
-    ``signs`` (n,): 1 for a dark one, -1 for one paler than what is beside it. A profile is the mean of three lines a
-    pixel apart; the dip under the line between its ends, as a share of that line, has its centroid where the feature
-    is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
-    """
-    m = 2 * reach + 1
-    dip, grey = np.empty(m), np.empty(3 * m)
-    h, w = image.shape
-    for i in range(len(origin)):
-        sd[i] = np.inf
-        du, dv = across[i]
-        centre = 0.0
-        for _ in range(2):
-            u0, v0 = origin[i, 0] + centre * du, origin[i, 1] + centre * dv
-            if not (reach + 2 <= u0 <= w - reach - 3 and reach + 2 <= v0 <= h - reach - 3):
-                sd[i] = np.inf
-                break
-            for c in range(3):
-                for k in range(m):
-                    u, v = u0 + (k - reach) * du - (c - 1) * dv, v0 + (k - reach) * dv - (1 - c) * du
-                    grey[c * m + k] = _grey_inside(image, u, v)
-            for k in range(m):
-                dip[k] = (grey[m + k] + (grey[k] + grey[2 * m + k])) / 3.0
-            left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
-            deepest = 0
-            for k in range(m):
-                dip[k] = signs[i] * (left + (right - left) * k / (m - 1.0) - dip[k])
-                if dip[k] > dip[deepest]:
-                    deepest = k
-            depth = dip[deepest]
-            if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
-                sd[i] = np.inf
-                break
-            # paint takes away a share of the light, whatever the light's slope across the feature
-            slope = (right - left) / (m - 1.0)
-            total, moment, reach_in = 0.0, 0.0, half_widths[i]
-            for k in range(m):
-                above = dip[k] - 0.15 * depth
-                if above > 0.0 and abs(k - deepest) <= reach_in:
-                    share = above / (left + slope * k)
-                    total += share
-                    moment += share * (k - reach)
-            centre += moment / total
-            # of the mean of three lines, over the squares of 1, 2, ... on either side
-            squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
-            sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
-        offset[i] = centre
-
-
-@kernel
-def find_dark(image, points, terms, lens, across, search, floor, place, sd):
-    """Place (n,) of dark features, at points (n, 3) of the shell, along unit vectors (n, 2); its sd, over a ``floor``.
-
-    ``terms``, ``lens``: as of `estimators._sight_kernels.project_points`. ``search``: reach, half widths, signs and
-    noise, as of `dark_centres`.
-    """
-    n = len(points)
-    expected = np.empty((n, 2))
-    for i in range(n):
-        u, v = pixel_of(points[i], terms, lens)
-        # what the lens does not see lies far from the picture
-        expected[i, 0], expected[i, 1] = (u, v) if math.isfinite(u) else (-1e6, -1e6)
-        place[i] = 0.0
-    reach, half_widths, signs, noise = search
-    dark_centres(image, expected, across, reach, half_widths, signs, noise, place, sd)
-    for i in range(n):
-        place[i] += expected[i, 0] * across[i, 0] + expected[i, 1] * across[i, 1]
-        sd[i] = math.sqrt(sd[i] * sd[i] + floor * floor)
-
-
-@inlined
-def _scatter(grey, begin, plain, last):
-    """Standard deviation of ``plain`` samples from the first; the last one counts for those behind it."""
-    mean, square = 0.0, 0.0
-    for j in range(plain):
-        mean += grey[min(begin + j, last - 1)]
-    mean /= plain
-    for j in range(plain):
-        square += (grey[min(begin + j, last - 1)] - mean) ** 2
-    return math.sqrt(square / plain)
-
-
-@inlined
-def _steepest(grey, inside, hit, half, slope):
-    """Place of the steepest slope of the largest step near the first one, by a parabola through three slopes."""
-    count, most, largest = len(grey), hit, 0.0
-    for j in range(hit, min(hit + 2 * half, count - half - 1) + 1):
-        size = abs(grey[j + half] - grey[j - half])
-        if inside[j] and size > largest:
-            most, largest = j, size
-    for j in range(max(most - half - 1, 0), min(most + half + 2, count)):
-        low, high = max(j - 1, 0), min(j + 1, count - 1)
-        slope[j] = abs(grey[high] - grey[low]) / (high - low)
-    at = max(most - half, 0)
-    for j in range(at, min(most + half + 1, count)):
-        if slope[j] > slope[at]:
-            at = j
-    at = min(max(at, 1), count - 2)
-    before, here, after = slope[at - 1], slope[at], slope[at + 1]
-    bend = min(before - 2.0 * here + after, -1e-9)
-    return at + min(max(0.5 * (before - after) / bend, -1.0), 1.0)
-
-
-@kernel
-def first_lasting_steps(grey, inside, limits, place):
-    """Sample (n,) at which the first step from a plain beginning is steepest, on lines (n, m) as sampled; else NaN.
-
-    ``limits``: samples of the plain beginning, on either side of a step; least step, and least over the beginning's
-    scatter.
-    """
-    plain, half, least, of_scatter = limits
-    n, m = grey.shape
-    slope = np.empty(m)
-    for i in range(n):
-        place[i] = np.nan
-        begin = 0
-        while begin < m and not inside[i, begin]:
-            begin += 1
-        held = min(begin + plain, m)
-        enough = max(least, of_scatter * max(_scatter(grey[i], begin, plain, held), 1.0))
-        for j in range(begin + half, m - half):
-            if inside[i, j] and abs(grey[i, j + half] - grey[i, j - half]) > enough:
-                place[i] = _steepest(grey[i], inside[i], j, half, slope)
-                break
 
 
 @kernel

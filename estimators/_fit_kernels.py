@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from estimators._edge_kernels import median
-from estimators._sight_kernels import COLUMNS, feet, project_edge, project_points, rotation_of
+from estimators.virtual_camera import COLUMNS, feet, project_edge, project_points, rotation_of
 from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
 from flightmodel.statistics import NORMAL_MAD
 

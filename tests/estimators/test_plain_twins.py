@@ -8,7 +8,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _edge_kernels, _fit_kernels, _sight_kernels, _texture_kernels
+from estimators import _edge_kernels, _fit_kernels, _texture_kernels
+from estimators.body_edge import first_lasting_steps
 from estimators.edge import (
     EDGE_BASES,
     EDGE_HALF,
@@ -22,8 +23,9 @@ from estimators.edge import (
     is_coherent,
     steps_near,
 )
+from estimators.features import dark_centres
 from estimators.frame_residuals import waves_round
-from estimators.virtual_camera import VirtualCamera
+from estimators.virtual_camera import VirtualCamera, feet, limb_points
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_clock, lv_direction
 from flightmodel.rendering import fill
@@ -127,7 +129,7 @@ def test_edge_of_a_torus_is_where_sight_touches_it():
     eye, ring, flat = np.array([-1.4, 0.25, -0.1]), (0.25, 0.3), 0.03
     clocks = np.deg2rad([10.0, 95.0, 250.0])
     points = np.empty((3, 3))
-    assert _sight_kernels.limb(circles, ring, flat, eye, clocks, points)
+    assert limb_points(circles, ring, flat, eye, clocks, points)
     aft, out = circles[:, 0] - ring[0], circles[:, 1] - ring[1]
     opened = np.column_stack([circles[:, 0] + flat * out, circles[:, 1] - flat * aft, circles[:, 2]])
     one_by_one = [plain_sight.limb(circle, eye, clocks[k : k + 1])[0] for k, circle in enumerate(opened)]
@@ -139,7 +141,7 @@ def test_distance_from_an_edge_has_a_side_and_a_foot():
     line = np.column_stack([100.0 + 200.0 * t, 50.0 + 30.0 * np.sin(3.0 * t)])
     found = np.array([[140.0, 60.0], [201.3, 90.0], [251.0, 50.0]])
     residual, rows, at = np.empty(3), np.empty((3, 16)), np.empty(3)
-    _sight_kernels.feet_on_edge(found, line, np.zeros((31, 2, 16)), residual, rows, at)
+    feet(found, line, np.zeros((31, 2, 16)), residual, rows, at)
     for point, r, foot in zip(found, residual, at, strict=True):
         away, where = plain_sight.distance_from_line(point, line)
         assert abs(r) == pytest.approx(away, rel=1e-9)
@@ -278,7 +280,7 @@ def centres(images, noise, sign=1.0):
     out = []
     for image in images:
         offset, sd = np.zeros(1), np.full(1, np.inf)
-        _edge_kernels.dark_centres(
+        dark_centres(
             image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), np.array([sign]), noise,
             offset, sd,
         )  # fmt: skip
@@ -304,7 +306,7 @@ def test_the_first_step_on_a_line_is_the_plain_one(top):
     grey, inside = np.empty((23, count)), np.empty((23, count), dtype=np.bool_)
     _edge_kernels.sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
     limits, place = (12, 4, 8.0, 4.0), np.empty(23)
-    _edge_kernels.first_lasting_steps(grey, inside, limits, place)
+    first_lasting_steps(grey, inside, limits, place)
     expected = plain_horizon.first_lasting_steps(grey, inside, limits)
     np.testing.assert_allclose(place, expected, atol=1e-9)
     assert 0 < np.isnan(place).sum() < 12
@@ -454,7 +456,7 @@ def test_the_fit_is_the_most_probable_one():
         m = len(edge[0])
         line = view.edge(bending)
         r, j, at = np.empty(m), np.empty((m, 16)), np.empty(m)
-        _sight_kernels.feet_on_edge(edge[0], line.pixels, line.jacobian, r, j, at)
+        feet(edge[0], line.pixels, line.jacobian, r, j, at)
         rows.append(r - edge[3])
         sight = view.sight(marks[0], bending)
         rows.append(marks[2] - np.einsum("ni,ni->n", sight.pixels, marks[1]))
