@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from estimators._edge_kernels import median
+from estimators.edge import median
 from estimators.virtual_camera import COLUMNS, feet, project_edge, project_points, rotation_of
 from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
 from flightmodel.statistics import NORMAL_MAD

@@ -33,7 +33,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators._edge_kernels import grey_inside
+from estimators.edge import grey_inside
 from estimators.virtual_camera import RADIUS, Sight, VirtualCamera, meets_centerbody, pixel_of
 from flightmodel._kernels import inlined, kernel
 from flightmodel.checks import BoolArray, FloatArray

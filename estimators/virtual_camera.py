@@ -11,6 +11,7 @@ torus, ``f`` being the motion per radian. Sliding along the surface moves a limb
 edge's motion normal to itself is that of the material point: derivatives are exact without differentiating the limb.
 
 Pictures of triangles (`flightmodel.rendering`) cost hundreds of times more: they serve overlays, masks and checks.
+Readable twin of the projection: ``tests/oracles/plain_sight.py``.
 
 Assumed: a rigid shell but for the flattening, tori of circular section; the lens of `flightmodel.camera`.
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _edge_kernels, _fit_kernels, _texture_kernels
+from estimators import _fit_kernels, _texture_kernels
 from estimators.body_edge import first_lasting_steps
 from estimators.edge import (
     EDGE_BASES,
@@ -20,7 +20,11 @@ from estimators.edge import (
     STEP_PX,
     WHOLE_BLUR_PX,
     ScanLines,
+    first_rises,
+    fit_steps,
     is_coherent,
+    sample_lines,
+    sky_levels,
     steps_near,
 )
 from estimators.features import dark_centres
@@ -174,13 +178,11 @@ def near_steps(places):
         image = smoothed(scene(place, 0.0, seed))
         origin, inward = np.array([[40.0, 30.0]]), np.array([[0.0, 1.0]])
         grey, inside = np.empty((1, len(NEAR_ALONG))), np.empty((1, len(NEAR_ALONG)), dtype=np.bool_)
-        _edge_kernels.sample_lines(
-            image, origin, inward, NEAR_ALONG[0], STEP_PX, np.zeros(2), np.array([80.0, 60.0]), grey, inside
-        )
+        sample_lines(image, origin, inward, NEAR_ALONG[0], STEP_PX, np.zeros(2), np.array([80.0, 60.0]), grey, inside)
         plain = plain_horizon.grey(image, np.full(len(NEAR_ALONG), 40.0), 30.0 + NEAR_ALONG)
         np.testing.assert_allclose(grey[0], plain, atol=1e-4)
         place_px, along, left, good = np.zeros(1), np.zeros(1), np.zeros_like(grey), np.zeros(1, dtype=np.bool_)
-        _edge_kernels.steps_near(grey, inside, 0.3, 8.0, NEAR_PLACES, NEAR_BASES, place_px, along, left, good)
+        fit_steps(grey, inside, 0.3, 8.0, NEAR_PLACES, NEAR_BASES, place_px, along, left, good)
         assert good[0]
         profile = grey[0] - np.median(grey[0, :6])
         best, curvature, rest = plain_horizon.best_place(profile, NEAR_PLACES, NEAR_BASES)
@@ -208,11 +210,11 @@ def first_rises_in(picture, noise):
     grey, inside = np.empty((n, m)), np.empty((n, m), dtype=np.bool_)
     height, width = picture.shape
     size = np.array([width, height], dtype=float)
-    _edge_kernels.sample_lines(image, origin, inward, -29.0, STEP_PX, np.zeros(2), size, grey, inside)
+    sample_lines(image, origin, inward, -29.0, STEP_PX, np.zeros(2), size, grey, inside)
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
-    _edge_kernels.sky_levels(grey, inside, 12, level, scatter, first)
+    sky_levels(grey, inside, 12, level, scatter, first)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    _edge_kernels.first_rises(
+    first_rises(
         grey, inside, level, first, noise, float(np.median(level)), (12, 6, 8.0), STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
     )  # fmt: skip
@@ -304,7 +306,7 @@ def test_the_first_step_on_a_line_is_the_plain_one(top):
     size, count = np.array([80.0, 60.0 + top]), 97
     origin[:, 1] += top
     grey, inside = np.empty((23, count)), np.empty((23, count), dtype=np.bool_)
-    _edge_kernels.sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
+    sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
     limits, place = (12, 4, 8.0, 4.0), np.empty(23)
     first_lasting_steps(grey, inside, limits, place)
     expected = plain_horizon.first_lasting_steps(grey, inside, limits)
