@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _fit_kernels, _texture_kernels
+from estimators import _fit_kernels
 from estimators.body_edge import first_lasting_steps
 from estimators.edge import (
     EDGE_BASES,
@@ -29,6 +29,7 @@ from estimators.edge import (
 )
 from estimators.features import dark_centres
 from estimators.frame_residuals import waves_round
+from estimators.texture import correlations, find_patches
 from estimators.virtual_camera import VirtualCamera, feet, limb_points
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_clock, lv_direction
@@ -337,7 +338,7 @@ def patch_of(rng):
 def test_correlation_of_a_patch_leaves_out_what_is_the_same_along_its_rows():
     picture, template = patch_of(np.random.default_rng(1))
     reach, score = 4, np.empty((9, 9))
-    assert _texture_kernels.correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
+    assert correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
     expected = np.empty((9, 9))
     for v, u in np.ndindex(9, 9):
         there = picture[22 + v : 33 + v, 25 + u : 36 + u].astype(float)
@@ -346,9 +347,9 @@ def test_correlation_of_a_patch_leaves_out_what_is_the_same_along_its_rows():
     np.testing.assert_allclose(score, expected, atol=1e-6)
     shaded = picture + np.linspace(0.0, 9.0, 60, dtype=np.float32)[:, None] ** 2
     again = np.empty((9, 9))
-    assert _texture_kernels.correlations(shaded, template, np.array([34.0, 31.0]), np.eye(2), reach, again)
+    assert correlations(shaded, template, np.array([34.0, 31.0]), np.eye(2), reach, again)
     np.testing.assert_allclose(again, score, atol=1e-5)
-    assert not _texture_kernels.correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
+    assert not correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
 
 
 def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
@@ -361,7 +362,7 @@ def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
         maps = [(back[..., k] + (32.0, 29.0)[k]).astype(np.float32) for k in (0, 1)]
         frame = cv2.remap(picture, *maps, cv2.INTER_CUBIC)
         place, sd = np.empty((1, 2)), np.empty((1, 2))
-        _texture_kernels.find_patches(
+        find_patches(
             frame, template[None], np.array([[32.0, 29.0]]), turn[None], np.eye(2)[None], (3, 0.8, 14.0), place, sd
         )
         # a small window's own energy changes as it is shifted, which moves a parabola's top by a tenth of a pixel
