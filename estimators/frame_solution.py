@@ -20,7 +20,7 @@ with ``c`` the camera, ``b`` the deflection of the benchmark frame, ``S = dc/db`
 the frame ``f`` and in the benchmark ``b``.
 
 Assumed: the shell moves as one body but for flattening and lobes; independent errors of edge points and features
-beside the modelled ones.
+beside the modelled ones. Readable twin of the fit: ``tests/oracles/plain_fit.py``.
 
 References
 ----------
@@ -30,21 +30,44 @@ Seed paper, CAD-based estimate. S. F. Schmidt's "consider" covariance, e.g. B. D
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators import _fit_kernels
 from estimators.body_edge import BodyEdge
 from estimators.edge import HorizonLine, ScanLines
 from estimators.features import Features, ImageFeatures, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS, MarkedFeatures
-from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
+from estimators.frame_residuals import (
+    HUBER,
+    ROUND_WAVES,
+    WAVES,
+    FrameResiduals,
+    FrameShape,
+    huber_weights,
+    light_columns,
+    lower_products,
+    turn_columns,
+    waves_round,
+)
 from estimators.texture import PaintedTexture
-from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
+from estimators.virtual_camera import (
+    CAMERA,
+    COLUMNS,
+    DEFLECTION,
+    JOINT,
+    RADIUS,
+    VirtualCamera,
+    feet,
+    project_edge,
+    project_points,
+    rotation_of,
+)
+from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
 from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, GateError, Issue
 from flightmodel.deflection import lv_clock
 
@@ -54,14 +77,16 @@ OUTLIER_PX = 5.0  # a point this far off lies on another edge or feature
 LEAST_POINTS, LEAST_FEATURES = 60, 40  # a quarter of the lines; a seventh of the reference shell's rows in view
 _LEAST_VAR = float(np.deg2rad(0.02) ** 2)  # of a difference: shapes that are not modelled, and points that err alike
 BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
-JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CAMERA.start + 6)
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
-LOBES = slice(2, 2 + _fit_kernels.LOBES)
+LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
+SHAPES = LOBES + 3  # light
+DONE, TOO_FEW, DIVERGED = 0, 1, 2
+_OF_LOBES = slice(2, 2 + LOBES)
 """Among flattening, joint station, lobes and light."""
 _NO_FEATURES: tuple[FloatArray, ...] = (*(np.zeros((0, k)) for k in (3, 2)), *np.zeros((3, 0)), np.zeros((0, 12)))
-SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
+SHAPE = np.array([2, *range(4, 4 + LOBES)])
 """Flattening and lobes among deflection, flattening, joint station, lobes and light."""
 _ANSWERED = np.array([0, 1, *SHAPE])
 
@@ -238,6 +263,223 @@ def refused_fit(
     )  # fmt: skip
 
 
+@inlined
+def _waves_of_point(clock, away, waves):
+    """Waves (12,) round the shell: of lobes across it, and times the distance ``away`` of those along its radius."""
+    c, s = math.cos(clock), math.sin(clock)
+    cosine, sine = c, s
+    for wave in range(4):
+        cosine, sine = cosine * c - sine * s, sine * c + cosine * s
+        waves[2 * wave], waves[2 * wave + 1] = cosine, sine
+        if wave < 2:
+            waves[8 + 2 * wave], waves[9 + 2 * wave] = away * cosine, away * sine
+
+
+@inlined
+def _lobe_columns(flattening, outwards, waves, shape):
+    """Derivatives by a flattening, and by a growth outwards, that vary round the shell as waves (12,).
+
+    ``flattening``, ``outwards``: derivatives by those that do not vary.
+    """
+    for j in range(8):
+        shape[j] = flattening * waves[j]
+    for j in range(8, LOBES):
+        shape[j] = outwards * waves[j]
+
+
+@inlined
+def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at):
+    """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
+    m, waves = len(found), np.empty(LOBES)
+    feet(found, pixels[:count], jacobian[:count], residual[:m], rows[:m], at)
+    for i in range(m):
+        residual[i] -= edge_offset[i]
+        j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
+        clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
+        _waves_of_point(clock, width, waves)
+        _lobe_columns(rows[i, 2], rows[i, RADIUS], waves, shape[i])
+        for c in range(3):
+            shape[i, LOBES + c] = light[i, c]
+
+
+@inlined
+def _feature_residuals(
+    spots, across, place, sd, feature_offset, waves, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
+):  # fmt: skip
+    """As `_edge_residuals` for features, in the rows behind the edge's; those beyond ``outlier`` px become NaN."""
+    p = len(spots)
+    project_points(spots, terms, lens, pixels, jacobian)
+    for i in range(p):
+        ax, ay = across[i]
+        residual[m + i] = place[i] - ax * pixels[i, 0] - ay * pixels[i, 1] - feature_offset[i]
+        if not (abs(residual[m + i]) < outlier and sd[i] < np.inf):
+            residual[m + i] = np.nan
+        for c in range(COLUMNS):
+            rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
+        _lobe_columns(rows[m + i, 2], rows[m + i, RADIUS], waves[i], shape[m + i])
+        for c in range(3):
+            shape[m + i, LOBES + c] = 0.0
+
+
+@inlined
+def _without_shape(residual, rows, shape, form, left):
+    """Residuals less what joint, lobes and light of the step before explain: they are no scatter."""
+    for i in range(len(residual)):
+        left[i] = residual[i] - rows[i, JOINT] * form[0]
+        for j in range(SHAPES):
+            left[i] -= shape[i, j] * form[1 + j]
+
+
+@inlined
+def _add_prior(prior, flattening, k, normal, right):
+    """Take the right side (n,) out of the last row, and add means and sd on all but ``k`` of a deflection."""
+    mean, sd = prior
+    for a in range(len(right)):
+        right[a] = normal[len(right), a]
+        if a >= k:
+            normal[a, a] += 1.0 / sd[a - k] ** 2
+            right[a] += mean[a - k] / sd[a - k] ** 2
+    # the flattening is carried from step to step, the others are counted from zero in each
+    right[k] -= flattening / sd[0] ** 2
+
+
+@inlined
+def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, room, normal, right):
+    """Weighted normal equations with priors, means and sd, on all but the deflection.
+
+    ``room``: designs (k + 18, n) of points, their residuals behind; twice as many weights. ``normal`` as wide.
+    """
+    k = basis.shape[1]
+    columns, used, weighted = room
+    count = 0
+    for i in range(len(residual)):
+        if weight[i] > 0.0:
+            for j in range(k):
+                columns[j, count] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[k, count], columns[k + 1, count] = rows[i, 2], rows[i, JOINT]
+            for j in range(SHAPES):
+                columns[k + 2 + j, count] = shape[i, j]
+            columns[k + 2 + SHAPES, count] = residual[i]
+            used[count] = weight[i]
+            count += 1
+    lower_products(columns, count, used, 0, weighted, normal)
+    _add_prior(prior, flattening, k, normal, right)
+
+
+@kernel
+def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight, left):
+    """Fit a deformation (3,) in place to edge points and features; its state, steps taken.
+
+    ``shell``: clocking angles of the edge, circles whose limb it is (`flightmodel.geometry.edge_circles`), ring about
+    which the shell flattens, distance of the outermost torus from it, joint station. ``edge``: points (m, 2), light
+    (m, 3), sd and residual at the benchmark (m,), NaN where it was not found. ``features``: points of the shell (p, 3),
+    directions (p, 2), places, sd, infinite where one was not found, residuals there (p,), waves round the shell there
+    (p, 12). ``prior``: mean and sd of flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual,
+    last step, steps, fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what
+    the fit makes of them, of joint and light. Rows with weight zero were not used; edge points come first.
+    """
+    clocks, circles, ring, width, joint = shell
+    found, light, edge_sd, edge_offset = edge
+    spots, across, place, feature_sd, feature_offset, waves = features
+    m, p, k = len(found), len(spots), basis.shape[1]
+    n = k + 2 + SHAPES
+    points, pixels = np.empty((len(clocks), 3)), np.empty((len(clocks), 2))
+    jacobian = np.empty((len(clocks), 2, COLUMNS))
+    spot_pixels, spot_jacobian = np.empty((p, 2)), np.empty((p, 2, COLUMNS))
+    kept, at = np.empty(len(clocks)), np.empty(m)
+    rotation, columns = np.empty((3, 3)), np.empty((3, 2))
+    scaled = np.empty(max(m, p))
+    room = np.empty((n + 1, m + p)), np.empty(m + p), np.empty(m + p)
+    normal, right = np.empty((n + 1, n + 1)), np.empty(n)
+    form = np.zeros(1 + SHAPES)
+    huber, outlier, last_step, steps, fewest = limits
+    for taken in range(steps):
+        rotation_of(deformation[0], deformation[1], rotation, columns)
+        terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
+        if m > 0:
+            count = project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept)
+            if count < 2:
+                return TOO_FEW, taken
+            _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
+        _feature_residuals(
+            spots, across, place, feature_sd, feature_offset, waves, terms, lens, outlier, m, spot_pixels,
+            spot_jacobian, residual, rows, shape,
+        )  # fmt: skip
+        _without_shape(residual, rows, shape, form, left)
+        edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)
+        if edges < fewest:
+            return TOO_FEW, edges
+        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, room, normal, right)
+        small_cholesky(normal, len(right), normal)
+        small_solve(normal, len(right), right)
+        step = right
+        for j in range(k):
+            deformation[0] += basis[0, j] * step[j]
+            deformation[1] += basis[1, j] * step[j]
+        deformation[2] += step[k]
+        for j in range(1 + SHAPES):
+            form[j] = step[k + 1 + j]
+        if not deformation[0] ** 2 + deformation[1] ** 2 < 0.25:
+            return DIVERGED, taken
+        largest = 0.0
+        for j in range(k + 1):
+            largest = max(largest, abs(step[j]))
+        if largest < last_step:
+            break
+    return DONE, taken + 1
+
+
+@kernel
+def solved_step(columns, residual, weight, prior, flattening, formal, found):
+    """Formal covariance (n, n) of a weighted least-squares step and the step ``found`` (n,), with the priors.
+
+    ``columns`` (m, n): derivatives by deflection, flattening, joint, lobes and light. ``prior``: mean and sd of all but
+    the deflection, the flattening's about ``flattening``, which comes on top of the step.
+    """
+    m, n = columns.shape
+    turned, normal = np.empty((n + 1, m)), np.empty((n + 1, n + 1))
+    turn_columns(columns, 0, turned)
+    for i in range(m):
+        turned[n, i] = residual[i]
+    lower_products(turned, m, weight, 0, np.empty(m), normal)
+    _add_prior(prior, flattening, n - len(prior[0]), normal, found)
+    small_cholesky(normal, n, normal)
+    small_solve(normal, n, found)
+    unit = np.empty(n)
+    for a in range(n):
+        unit[:] = 0.0
+        unit[a] = 1.0
+        small_solve(normal, n, unit)
+        for b in range(n):
+            formal[a, b] = unit[b]
+
+
+@kernel
+def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
+    """Move what belongs to points with a weight to the front; their number, and the weighted square of ``left``.
+
+    ``columns`` (n, k + 17): derivatives by deflection, flattening, joint, lobes and light. ``of_used``: places of the
+    points, their rows (n, 16), residuals and weights.
+    """
+    at, used_rows, used_residual, used_weight = of_used
+    k, count, square, total = basis.shape[1], 0, 0.0, 0.0
+    for i in range(len(weight)):
+        if weight[i] > 0.0:
+            at[count] = i
+            for j in range(k):
+                columns[count, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[count, k], columns[count, k + 1] = rows[i, 2], rows[i, JOINT]
+            for j in range(SHAPES):
+                columns[count, k + 2 + j] = shape[i, j]
+            for j in range(COLUMNS):
+                used_rows[count, j] = rows[i, j]
+            used_residual[count], used_weight[count] = residual[i], weight[i]
+            square += weight[i] * left[i] * left[i]
+            total += weight[i]
+            count += 1
+    return count, square / total if total > 0.0 else 0.0
+
+
 @dataclass(frozen=True)
 class FrameModel:
     """A virtual camera whose orientation and lens were fitted on a benchmark frame; see `estimators.benchmark`.
@@ -384,8 +626,8 @@ class FrameModel:
         """
         mean, sd = self._shape_prior(2)
         if np.sum((both.shape_found / sd) ** 2) < WORST_SHAPE:
-            mean[LOBES] = both.shape_found[LOBES]
-        sd[LOBES] = self.apriori.higher_lobes_rad
+            mean[_OF_LOBES] = both.shape_found[_OF_LOBES]
+        sd[_OF_LOBES] = self.apriori.higher_lobes_rad
         return mean, sd
 
     def _fit_points(
@@ -406,19 +648,19 @@ class FrameModel:
         prior = prior or self._shape_prior(k)
         count = len(edge_at)
         residual, left, weight = np.empty((3, count))
-        rows, shape = np.zeros((count, 16)), np.zeros((count, _fit_kernels.SHAPES))
+        rows, shape = np.zeros((count, COLUMNS)), np.zeros((count, SHAPES))
         least = least_points(horizon)
         limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if found >= LEAST_FEATURES else least)
-        state, number = _fit_kernels.fit_frame(
+        state, number = fit_frame(
             deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
             limits, residual, rows, shape, weight, left,
         )  # fmt: skip
-        if state == _fit_kernels.TOO_FEW:
+        if state == TOO_FEW:
             raise NoFitError(
                 f"{number} edge points also found at the benchmark where {least} are needed",
                 "edge-points-too-few",
             )
-        if state == _fit_kernels.DIVERGED:
+        if state == DIVERGED:
             raise NoFitError("the fit diverged beyond 28 deg", "fit-diverged")
         return Fitted(residual, left, rows, shape, weight, edge_at, len(edge_offset))
 
@@ -433,7 +675,7 @@ class FrameModel:
         n, width = len(found.weight), k + len(sd)
         columns, at, rows = np.empty((n, width)), np.empty(n, dtype=np.intp), np.empty((n, found.rows.shape[1]))
         residual, weight = np.empty((2, n))
-        count, square = _fit_kernels.used_points(
+        count, square = used_points(
             np.ascontiguousarray(basis), found.rows, found.shape, found.residual_px, found.left_px, found.weight,
             columns, (at, rows, residual, weight),
         )  # fmt: skip
@@ -451,7 +693,7 @@ class FrameModel:
         columns, at, rows = columns[:count], at[:count], rows[:count]
         residual, weight = residual[:count], weight[:count]
         formal, step = np.empty((width, width)), np.empty(width)
-        _fit_kernels.solved(columns, residual, weight, prior, float(deformation[2]), formal, step)
+        solved_step(columns, residual, weight, prior, float(deformation[2]), formal, step)
         before = self.benchmark_residuals.rows[found.benchmark_at[at]]
         edge_count = int(np.searchsorted(at, found.edge_points))
         # the flattening's value was carried from step to step, the others are counted from zero in each
@@ -482,7 +724,7 @@ class FrameModel:
         edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
         design, weight = both.columns[edge], both.weight[edge]
         formal, step = np.empty_like(both.formal), np.empty(len(both.formal))
-        _fit_kernels.solved(design, both.residual_px[edge], weight, (mean, sd), flattening_rad, formal, step)
+        solved_step(design, both.residual_px[edge], weight, (mean, sd), flattening_rad, formal, step)
         # features that contradict the edge leave it residuals that are none of its scatter
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _fit_kernels
 from estimators.body_edge import first_lasting_steps
 from estimators.edge import (
     EDGE_BASES,
@@ -28,7 +27,9 @@ from estimators.edge import (
     steps_near,
 )
 from estimators.features import dark_centres
-from estimators.frame_residuals import waves_round
+from estimators.frame_checks import motion_beside
+from estimators.frame_residuals import huber_weights, waves_round
+from estimators.frame_solution import DONE, SHAPES, fit_frame
 from estimators.texture import correlations, find_patches
 from estimators.virtual_camera import VirtualCamera, feet, limb_points
 from flightmodel.camera import Camera, camera_from_mount
@@ -412,12 +413,12 @@ def fitted(view, edge, marks, prior, start):
     out = (
         np.empty(count),
         np.zeros((count, 16)),
-        np.zeros((count, _fit_kernels.SHAPES)),
+        np.zeros((count, SHAPES)),
         np.empty(count),
         np.empty(count),
     )
     limits = (1.5, 12.0, 1e-9, 30, 4)
-    state, _ = _fit_kernels.fit_frame(
+    state, _ = fit_frame(
         bending,
         np.eye(2),
         view.shell_terms,
@@ -428,7 +429,7 @@ def fitted(view, edge, marks, prior, start):
         limits,
         *out,
     )
-    assert state == _fit_kernels.DONE
+    assert state == DONE
     return bending, out
 
 
@@ -481,7 +482,7 @@ def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
     residual, weight = rng.normal(size=61), rng.random(61)
     formal = np.linalg.inv((columns.T * weight) @ columns + np.diag(rng.random(19)))
     motion = np.empty(terms)
-    square = _fit_kernels.motion_beside(columns, formal, by, residual, weight, 0.02, motion)
+    square = motion_beside(columns, formal, by, residual, weight, 0.02, motion)
     expected, expected_square = plain_fit.motion_beside(columns, formal, by, residual, weight, 0.02)
     np.testing.assert_allclose(motion, expected, rtol=1e-7, atol=1e-12)
     assert square == pytest.approx(expected_square, rel=1e-8, abs=1e-12)
@@ -491,7 +492,7 @@ def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
 def test_large_residuals_pull_no_harder_than_huber_lets_them():
     residual = np.array([0.1, -0.2, 0.15, -0.1, 0.05, 8.0, np.nan])
     weight, scaled = np.empty(7), np.empty(7)
-    edges = _fit_kernels.huber_weights(7, 0, np.full(7, 0.2), np.empty(0), 1.5, residual, scaled, weight)
+    edges = huber_weights(7, 0, np.full(7, 0.2), np.empty(0), 1.5, residual, scaled, weight)
     assert edges == 6
     assert weight[6] == 0.0
     scale = 1.0 / np.sqrt(weight[0])
