@@ -35,7 +35,7 @@ from estimators.camera import read_film
 from estimators.camera_fit import REACH_PX
 from estimators.edge import find_horizon
 from estimators.frame_residuals import HUBER
-from estimators.frame_solution import JOINT
+from estimators.virtual_camera import JOINT
 from flightmodel import rotations
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.film import film_frames

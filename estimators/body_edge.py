@@ -18,14 +18,15 @@ light and shadow that shift a part of the edge may look like one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
-from estimators import _edge_kernels
 from estimators.edge import STEP_PX, KeptPicture, ScanLines, is_coherent, sampled
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
+from flightmodel._kernels import inlined, kernel
 from flightmodel.checks import BoolArray, FloatArray
 
 _EVERY_PX = 2  # along the silhouette, of which a camera may see no more than a corner
@@ -142,11 +143,67 @@ def _lines(view: VirtualCamera) -> ScanLines | None:
     return ScanLines(np.column_stack([u, v]).astype(float), out, _REACH_PX, _REACH_PX, np.arange(len(kept)))
 
 
+@inlined
+def _scatter(grey, begin, plain, last):
+    """Standard deviation of ``plain`` samples from the first; the last one counts for those behind it."""
+    mean, square = 0.0, 0.0
+    for j in range(plain):
+        mean += grey[min(begin + j, last - 1)]
+    mean /= plain
+    for j in range(plain):
+        square += (grey[min(begin + j, last - 1)] - mean) ** 2
+    return math.sqrt(square / plain)
+
+
+@inlined
+def _steepest(grey, inside, hit, half, slope):
+    """Place of the steepest slope of the largest step near the first one, by a parabola through three slopes."""
+    count, most, largest = len(grey), hit, 0.0
+    for j in range(hit, min(hit + 2 * half, count - half - 1) + 1):
+        size = abs(grey[j + half] - grey[j - half])
+        if inside[j] and size > largest:
+            most, largest = j, size
+    for j in range(max(most - half - 1, 0), min(most + half + 2, count)):
+        low, high = max(j - 1, 0), min(j + 1, count - 1)
+        slope[j] = abs(grey[high] - grey[low]) / (high - low)
+    at = max(most - half, 0)
+    for j in range(at, min(most + half + 1, count)):
+        if slope[j] > slope[at]:
+            at = j
+    at = min(max(at, 1), count - 2)
+    before, here, after = slope[at - 1], slope[at], slope[at + 1]
+    bend = min(before - 2.0 * here + after, -1e-9)
+    return at + min(max(0.5 * (before - after) / bend, -1.0), 1.0)
+
+
+@kernel
+def first_lasting_steps(grey, inside, limits, place):
+    """Sample (n,) at which the first step from a plain beginning is steepest, on lines (n, m) as sampled; else NaN.
+
+    ``limits``: samples of the plain beginning, on either side of a step; least step, and least over the beginning's
+    scatter.
+    """
+    plain, half, least, of_scatter = limits
+    n, m = grey.shape
+    slope = np.empty(m)
+    for i in range(n):
+        place[i] = np.nan
+        begin = 0
+        while begin < m and not inside[i, begin]:
+            begin += 1
+        held = min(begin + plain, m)
+        enough = max(least, of_scatter * max(_scatter(grey[i], begin, plain, held), 1.0))
+        for j in range(begin + half, m - half):
+            if inside[i, j] and abs(grey[i, j + half] - grey[i, j - half]) > enough:
+                place[i] = _steepest(grey[i], inside[i], j, half, slope)
+                break
+
+
 def _places(picture: KeptPicture, lines: ScanLines) -> FloatArray:
     """Where the edge lies on each line (n,), px from its origin; NaN where there is none, or none beside it."""
     grey, inside = sampled(picture, lines, round(2.0 * _REACH_PX / STEP_PX) + 1)
     at = np.empty(len(lines.index))
-    _edge_kernels.first_lasting_steps(grey, inside, (_LEVEL, _HALF, _LEAST_STEP, _OF_SCATTER), at)
+    first_lasting_steps(grey, inside, (_LEVEL, _HALF, _LEAST_STEP, _OF_SCATTER), at)
     place = STEP_PX * at - _REACH_PX
     place[~is_coherent(lines.index, _SMOOTHER * place)] = np.nan
     return place

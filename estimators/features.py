@@ -24,6 +24,7 @@ R. Y. Rubinstein, D. P. Kroese, "The Cross-Entropy Method", 2004.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -32,8 +33,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators import _edge_kernels
-from estimators.virtual_camera import RADIUS, Sight, VirtualCamera, meets_centerbody
+from estimators.edge import grey_inside
+from estimators.virtual_camera import RADIUS, Sight, VirtualCamera, meets_centerbody, pixel_of
+from flightmodel._kernels import inlined, kernel
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.geometry import (
@@ -102,6 +104,79 @@ class Features(Protocol):
         ...
 
 
+@inlined
+def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset, sd):
+    """Offset along unit vectors ``across`` (n, 2) from ``origin`` (n, 2), px, of the dark line or spot there.
+
+    ``signs`` (n,): 1 for a dark one, -1 for one paler than what is beside it. A profile is the mean of three lines a
+    pixel apart; the dip under the line between its ends, as a share of that line, has its centroid where the feature
+    is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
+    """
+    m = 2 * reach + 1
+    dip, grey = np.empty(m), np.empty(3 * m)
+    h, w = image.shape
+    for i in range(len(origin)):
+        sd[i] = np.inf
+        du, dv = across[i]
+        centre = 0.0
+        for _ in range(2):
+            u0, v0 = origin[i, 0] + centre * du, origin[i, 1] + centre * dv
+            if not (reach + 2 <= u0 <= w - reach - 3 and reach + 2 <= v0 <= h - reach - 3):
+                sd[i] = np.inf
+                break
+            for c in range(3):
+                for k in range(m):
+                    u, v = u0 + (k - reach) * du - (c - 1) * dv, v0 + (k - reach) * dv - (1 - c) * du
+                    grey[c * m + k] = grey_inside(image, u, v)
+            for k in range(m):
+                dip[k] = (grey[m + k] + (grey[k] + grey[2 * m + k])) / 3.0
+            left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
+            deepest = 0
+            for k in range(m):
+                dip[k] = signs[i] * (left + (right - left) * k / (m - 1.0) - dip[k])
+                if dip[k] > dip[deepest]:
+                    deepest = k
+            depth = dip[deepest]
+            if depth < max(5.0 * noise, 6.0) or deepest < 2 or deepest > m - 3:
+                sd[i] = np.inf
+                break
+            # paint takes away a share of the light, whatever the light's slope across the feature
+            slope = (right - left) / (m - 1.0)
+            total, moment, reach_in = 0.0, 0.0, half_widths[i]
+            for k in range(m):
+                above = dip[k] - 0.15 * depth
+                if above > 0.0 and abs(k - deepest) <= reach_in:
+                    share = above / (left + slope * k)
+                    total += share
+                    moment += share * (k - reach)
+            centre += moment / total
+            # of the mean of three lines, over the squares of 1, 2, ... on either side
+            squares = reach_in * (reach_in + 1.0) * (2.0 * reach_in + 1.0) / 3.0
+            sd[i] = noise / (left + slope * deepest) * math.sqrt(squares / 3.0) / total
+        offset[i] = centre
+
+
+@kernel
+def find_dark(image, points, terms, lens, across, search, floor, place, sd):
+    """Place (n,) of dark features, at points (n, 3) of the shell, along unit vectors (n, 2); its sd, over a ``floor``.
+
+    ``terms``, ``lens``: as of `estimators.virtual_camera.project_points`. ``search``: reach, half widths, signs and
+    noise, as of `dark_centres`.
+    """
+    n = len(points)
+    expected = np.empty((n, 2))
+    for i in range(n):
+        u, v = pixel_of(points[i], terms, lens)
+        # what the lens does not see lies far from the picture
+        expected[i, 0], expected[i, 1] = (u, v) if math.isfinite(u) else (-1e6, -1e6)
+        place[i] = 0.0
+    reach, half_widths, signs, noise = search
+    dark_centres(image, expected, across, reach, half_widths, signs, noise, place, sd)
+    for i in range(n):
+        place[i] += expected[i, 0] * across[i, 0] + expected[i, 1] * across[i, 1]
+        sd[i] = math.sqrt(sd[i] * sd[i] + floor * floor)
+
+
 @dataclass(frozen=True)
 class ImageFeatures:
     """Features in the camera's view, one row a direction in which one is measured.
@@ -137,7 +212,7 @@ class ImageFeatures:
         """See `Features.find`."""
         place, sd = np.empty((2, len(self.points_shell_m)))
         search = (reach_px, self.half_width_px, self.signs, _NOISE_GREY)
-        _edge_kernels.find_dark(
+        find_dark(
             image, self.points_shell_m, view.terms(deformation), view.camera.lens_terms, self.across_px, search,
             _SD_FLOOR_PX, place, sd,
         )  # fmt: skip

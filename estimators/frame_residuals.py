@@ -12,14 +12,16 @@ P. J. Huber, "Robust Statistics", 1981, chapter 7.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.edge import HorizonLine
+from estimators.edge import HorizonLine, median
 from estimators.features import Features
 from estimators.virtual_camera import FLATTENING, RADIUS, VirtualCamera
+from flightmodel._kernels import inlined
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
 from flightmodel.statistics import NORMAL_MAD
@@ -176,3 +178,59 @@ def huber_gain(
     weighted = design.T * weight
     covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)
     return covariance @ weighted, covariance, float(np.sqrt(np.average(residual**2, weights=weight)))
+
+
+@inlined
+def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
+    """Weights, zero where a residual is NaN; the number of edge points with one."""
+    edges = 0
+    # each kind's sd is inflated to the scatter of its residuals; then Huber's weights
+    for kind in range(2):
+        start, size = (0, m) if kind == 0 else (m, p)
+        sd = edge_sd if kind == 0 else feature_sd
+        used = 0
+        for i in range(size):
+            if math.isfinite(residual[start + i]):
+                scaled[used] = residual[start + i]
+                used += 1
+        if kind == 0:
+            edges = used
+        inflate = 1.0
+        if used > 0:
+            centre = median(scaled, used)
+            used = 0
+            for i in range(size):
+                if math.isfinite(residual[start + i]):
+                    scaled[used] = abs(residual[start + i] - centre) / sd[i]
+                    used += 1
+            inflate = max(NORMAL_MAD * median(scaled, used), 1.0)
+        for i in range(size):
+            weight[start + i] = 0.0
+            if math.isfinite(residual[start + i]):
+                scale = sd[i] * inflate
+                weight[start + i] = 1.0 / (scale * scale) / max(1.0, abs(residual[start + i]) / (huber * scale))
+    return edges
+
+
+@inlined
+def turn_columns(columns, first, turned):
+    """Columns (n, q) as rows from ``first`` on."""
+    for i in range(len(columns)):
+        for j in range(columns.shape[1]):
+            turned[first + j, i] = columns[i, j]
+
+
+@inlined
+def lower_products(columns, count, weight, first, weighted, product):
+    """Weighted products of points' columns, one a row (q, n), with those up to themselves, from the ``first`` row on.
+
+    ``weighted`` (n,): room for one. Sums along rows run in vector registers.
+    """
+    for a in range(first, len(columns)):
+        for i in range(count):
+            weighted[i] = weight[i] * columns[a, i]
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(count):
+                total += weighted[i] * columns[b, i]
+            product[a, b] = total

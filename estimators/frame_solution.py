@@ -20,7 +20,7 @@ with ``c`` the camera, ``b`` the deflection of the benchmark frame, ``S = dc/db`
 the frame ``f`` and in the benchmark ``b``.
 
 Assumed: the shell moves as one body but for flattening and lobes; independent errors of edge points and features
-beside the modelled ones.
+beside the modelled ones. Readable twin of the fit: ``tests/oracles/plain_fit.py``.
 
 References
 ----------
@@ -30,40 +30,47 @@ Seed paper, CAD-based estimate. S. F. Schmidt's "consider" covariance, e.g. B. D
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators import _fit_kernels
-from estimators.body_edge import BodyEdge
-from estimators.edge import HorizonLine, ScanLines
-from estimators.features import Features, ImageFeatures, light_shift
-from estimators.frame_checks import WORST_SHAPE
-from estimators.frame_edits import LEAST_MARKS, MarkedFeatures
-from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
-from estimators.texture import PaintedTexture
-from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
-from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, GateError, Issue
-from flightmodel.deflection import lv_clock
+from estimators.edge import HorizonLine
+from estimators.frame_edits import LEAST_MARKS
+from estimators.frame_residuals import (
+    ROUND_WAVES,
+    WAVES,
+    FrameShape,
+    huber_weights,
+    lower_products,
+    turn_columns,
+)
+from estimators.virtual_camera import (
+    CAMERA,
+    COLUMNS,
+    DEFLECTION,
+    JOINT,
+    RADIUS,
+    feet,
+    project_edge,
+    project_points,
+    rotation_of,
+)
+from flightmodel._kernels import inlined, kernel, small_cholesky, small_solve
+from flightmodel.checks import NO_FAULT, FloatArray, GateError, Issue
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
 LAST_STEP_RAD = 2e-5  # 0.001 deg, far below any frame's sd
 OUTLIER_PX = 5.0  # a point this far off lies on another edge or feature
 LEAST_POINTS, LEAST_FEATURES = 60, 40  # a quarter of the lines; a seventh of the reference shell's rows in view
-_LEAST_VAR = float(np.deg2rad(0.02) ** 2)  # of a difference: shapes that are not modelled, and points that err alike
-BESIDE = 4  # places of 240 along the edge: a residual of the benchmark frame holds that far for a mark by hand
-JOINT = HELD.stop - 1
 POSED = slice(CAMERA.start, JOINT)
 TURN, CENTRE = slice(CAMERA.start, CAMERA.start + 4), slice(CAMERA.start + 4, CAMERA.start + 6)
 _SOFT_WAVES = 3  # a ring's stiffness grows as (n^2 - 1)^2: 9, 64, 225, 576
-LOBES = slice(2, 2 + _fit_kernels.LOBES)
-"""Among flattening, joint station, lobes and light."""
-_NO_FEATURES: tuple[FloatArray, ...] = (*(np.zeros((0, k)) for k in (3, 2)), *np.zeros((3, 0)), np.zeros((0, 12)))
-SHAPE = np.array([2, *range(4, 4 + _fit_kernels.LOBES)])
-"""Flattening and lobes among deflection, flattening, joint station, lobes and light."""
-_ANSWERED = np.array([0, 1, *SHAPE])
+LOBES = 12  # cosine and sine of lobes of two to five waves (8) and of rings out of round of two and three (4)
+SHAPES = LOBES + 3  # light
+DONE, TOO_FEW, DIVERGED = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -238,316 +245,218 @@ def refused_fit(
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class FrameModel:
-    """A virtual camera whose orientation and lens were fitted on a benchmark frame; see `estimators.benchmark`.
+@inlined
+def _waves_of_point(clock, away, waves):
+    """Waves (12,) round the shell: of lobes across it, and times the distance ``away`` of those along its radius."""
+    c, s = math.cos(clock), math.sin(clock)
+    cosine, sine = c, s
+    for wave in range(4):
+        cosine, sine = cosine * c - sine * s, sine * c + cosine * s
+        waves[2 * wave], waves[2 * wave + 1] = cosine, sine
+        if wave < 2:
+            waves[8 + 2 * wave], waves[9 + 2 * wave] = away * cosine, away * sine
 
-    Parameters
-    ----------
-    view : VirtualCamera
-    clocks_rad : (n,) float
-        Places of the shell's edge that are looked for.
-    lines : ScanLines
-        Where they are searched without a deflection to start from.
-    features : Features
-        Features that are looked for.
-    apriori : AprioriSd
-    benchmark : HorizonLine
-    benchmark_residuals : FrameResiduals
-        Residuals, rows and sd of the points found in the benchmark frame.
-    corrections : (8,) float
-        Three rotations in camera axes, rad, focal scale less one, principal point, px, k1 and k2, against nominal.
-    posed_covariance : (12, 12) float
-        Of the corrections, camera position and shell radius.
-    posed_per_deflection : (12, 2) float
-        Their shift per radian of deflection of the benchmark frame.
-    residual_rms_px : float
-        Of the benchmark frame.
-    stated_refused : Issue
-        Why the features that the vehicle file states are not used; empty where they are, or where it states none.
-    support : float
-        Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
-        frame shows.
-    breaks : (m,) int
-        Rows after which the benchmark frame breaks across its width.
-    steepness : float
-        Of the benchmark frame's edge; see `estimators.edge.steepness_of`.
-    body : BodyEdge or None
-        The centerbody's silhouette in the benchmark frame.
+
+@inlined
+def _lobe_columns(flattening, outwards, waves, shape):
+    """Derivatives by a flattening, and by a growth outwards, that vary round the shell as waves (12,).
+
+    ``flattening``, ``outwards``: derivatives by those that do not vary.
     """
+    for j in range(8):
+        shape[j] = flattening * waves[j]
+    for j in range(8, LOBES):
+        shape[j] = outwards * waves[j]
 
-    view: VirtualCamera
-    clocks_rad: FloatArray
-    lines: ScanLines
-    features: Features
-    apriori: AprioriSd
-    benchmark: HorizonLine
-    benchmark_residuals: FrameResiduals = field(repr=False)
-    corrections: FloatArray
-    posed_covariance: FloatArray = field(repr=False)
-    posed_per_deflection: FloatArray = field(repr=False)
-    residual_rms_px: float
-    stated_refused: Issue = NO_FAULT
-    support: float = 1.0
-    breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
-    steepness: float = float("nan")
-    body: BodyEdge | None = field(default=None, repr=False)
 
-    @cached_property
-    def _benchmark_edge(self) -> BoolArray:
-        """Which of the points found in the benchmark frame are the edge's, the others are features."""
-        return np.asarray(self.benchmark_residuals.index < len(self.clocks_rad))
+@inlined
+def _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at):
+    """Residuals, derivatives and shape columns of edge points, the benchmark's residuals subtracted."""
+    m, waves = len(found), np.empty(LOBES)
+    feet(found, pixels[:count], jacobian[:count], residual[:m], rows[:m], at)
+    for i in range(m):
+        residual[i] -= edge_offset[i]
+        j = min(int(at[i]), count - 2) if math.isfinite(residual[i]) else 0
+        clock = kept[j] + (at[i] - j) * (kept[j + 1] - kept[j])
+        _waves_of_point(clock, width, waves)
+        _lobe_columns(rows[i, 2], rows[i, RADIUS], waves, shape[i])
+        for c in range(3):
+            shape[i, LOBES + c] = light[i, c]
 
-    @cached_property
-    def _edge_at_benchmark(self) -> int:
-        """Edge points found in the benchmark frame."""
-        return int(self._benchmark_edge.sum())
 
-    def features_at_benchmark(self, painted: bool) -> int:
-        """Painted features found in the benchmark frame, or all other ones."""
-        rows = self.benchmark_residuals.index[~self._benchmark_edge] - len(self.clocks_rad)
-        return int(((rows < self.painted_rows) == painted).sum())
+@inlined
+def _feature_residuals(
+    spots, across, place, sd, feature_offset, waves, terms, lens, outlier, m, pixels, jacobian, residual, rows, shape
+):  # fmt: skip
+    """As `_edge_residuals` for features, in the rows behind the edge's; those beyond ``outlier`` px become NaN."""
+    p = len(spots)
+    project_points(spots, terms, lens, pixels, jacobian)
+    for i in range(p):
+        ax, ay = across[i]
+        residual[m + i] = place[i] - ax * pixels[i, 0] - ay * pixels[i, 1] - feature_offset[i]
+        if not (abs(residual[m + i]) < outlier and sd[i] < np.inf):
+            residual[m + i] = np.nan
+        for c in range(COLUMNS):
+            rows[m + i, c] = ax * jacobian[i, 0, c] + ay * jacobian[i, 1, c]
+        _lobe_columns(rows[m + i, 2], rows[m + i, RADIUS], waves[i], shape[m + i])
+        for c in range(3):
+            shape[m + i, LOBES + c] = 0.0
 
-    @property
-    def painted_rows(self) -> int:
-        """How many rows of the features, the first, are painted ones."""
-        return 0 if self.painted is None else len(self.painted.across_px)
 
-    @property
-    def unmarked(self) -> Features:
-        """Features without those that an analyst marked."""
-        return self.features.found if isinstance(self.features, MarkedFeatures) else self.features
+@inlined
+def _without_shape(residual, rows, shape, form, left):
+    """Residuals less what joint, lobes and light of the step before explain: they are no scatter."""
+    for i in range(len(residual)):
+        left[i] = residual[i] - rows[i, JOINT] * form[0]
+        for j in range(SHAPES):
+            left[i] -= shape[i, j] * form[1 + j]
 
-    @cached_property
-    def painted(self) -> ImageFeatures | None:
-        """Features of known places on the shell; None where there is texture, or nothing."""
-        found = self.unmarked.painted if isinstance(self.unmarked, PaintedTexture) else self.unmarked
-        return found if isinstance(found, ImageFeatures) and len(found.points_shell_m) else None
 
-    @property
-    def edge_in_view(self) -> float:
-        """Share of the edge looked for that the benchmark frame shows."""
-        return self._edge_at_benchmark / max(len(self.clocks_rad), 1)
+@inlined
+def _add_prior(prior, flattening, k, normal, right):
+    """Take the right side (n,) out of the last row, and add means and sd on all but ``k`` of a deflection."""
+    mean, sd = prior
+    for a in range(len(right)):
+        right[a] = normal[len(right), a]
+        if a >= k:
+            normal[a, a] += 1.0 / sd[a - k] ** 2
+            right[a] += mean[a - k] / sd[a - k] ** 2
+    # the flattening is carried from step to step, the others are counted from zero in each
+    right[k] -= flattening / sd[0] ** 2
 
-    def _edge_share(self, points: int) -> float:
-        """So many edge points over those of the benchmark frame; none where that shows no edge."""
-        there = self._edge_at_benchmark
-        return points / there if there else 0.0
 
-    def _at_benchmark(
-        self, index: NDArray[np.intp], beside: int = 0
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """Of points found at the benchmark too, or so many places beside it: residual (NaN where not), sd, its row."""
-        if beside:
-            return self._nearest_at_benchmark(index, beside)
-        offset, sd, at = self._every_place_at_benchmark
-        return offset[index], sd[index], at[index]
+@inlined
+def _normal_equations(basis, flattening, prior, residual, rows, shape, weight, room, normal, right):
+    """Weighted normal equations with priors, means and sd, on all but the deflection.
 
-    @cached_property
-    def _every_place_at_benchmark(self) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """`_at_benchmark` of all places of the edge and rows of features."""
-        return self._nearest_at_benchmark(np.arange(len(self.clocks_rad) + len(self.features.across_px)), 0)
+    ``room``: designs (k + 18, n) of points, their residuals behind; twice as many weights. ``normal`` as wide.
+    """
+    k = basis.shape[1]
+    columns, used, weighted = room
+    count = 0
+    for i in range(len(residual)):
+        if weight[i] > 0.0:
+            for j in range(k):
+                columns[j, count] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[k, count], columns[k + 1, count] = rows[i, 2], rows[i, JOINT]
+            for j in range(SHAPES):
+                columns[k + 2 + j, count] = shape[i, j]
+            columns[k + 2 + SHAPES, count] = residual[i]
+            used[count] = weight[i]
+            count += 1
+    lower_products(columns, count, used, 0, weighted, normal)
+    _add_prior(prior, flattening, k, normal, right)
 
-    def _nearest_at_benchmark(
-        self, index: NDArray[np.intp], beside: int
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        before = self.benchmark_residuals
-        last = len(before.index) - 1
-        at = np.minimum(np.searchsorted(before.index, index), last)
-        lower = np.maximum(at - 1, 0)
-        at = np.where(np.abs(before.index[lower] - index) < np.abs(before.index[at] - index), lower, at)
-        there = np.abs(before.index[at] - index) <= beside
-        return np.where(there, before.residual_px[at], np.nan), before.sd_px[at], at
 
-    @cached_property
-    def _waves(self) -> FloatArray:
-        """Waves (n, 12) round the shell at all features; see `waves_round`."""
-        points = self.features.points_shell_m
-        return waves_round(lv_clock(points[:, 1:]), self.view.from_ring_m(points))
+@kernel
+def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, residual, rows, shape, weight, left):
+    """Fit a deformation (3,) in place to edge points and features; its state, steps taken.
 
-    @cached_property
-    def _shape_sd(self) -> FloatArray:
-        """A priori sd of flattening, joint station, lobes (12) and light (3) of a frame against the benchmark."""
-        apriori = self.apriori
-        light = [np.sqrt(2.0) * apriori.edge_px] * 3
-        return np.array([apriori.flattening_rad, apriori.joint_station_m, *apriori.lobe_sd_rad, *light])
-
-    def _shape_prior(self, k: int) -> tuple[FloatArray, FloatArray]:
-        """Prior mean and sd of the shape, which must not absorb what an assumed plane (k = 1) cannot explain."""
-        return np.zeros(len(self._shape_sd)), self._shape_sd * (1.0 if k == 2 else 1e-3)
-
-    def _prior_about(self, both: Solution) -> tuple[FloatArray, FloatArray]:
-        """Prior mean and sd of the shape that the edge alone sees: lobes about those of edge and features together.
-
-        Free lobes would let half of an edge agree with features that are a degree off, and so would lobes that no shell
-        has.
-        """
-        mean, sd = self._shape_prior(2)
-        if np.sum((both.shape_found / sd) ** 2) < WORST_SHAPE:
-            mean[LOBES] = both.shape_found[LOBES]
-        sd[LOBES] = self.apriori.higher_lobes_rad
-        return mean, sd
-
-    def _fit_points(
-        self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
-        basis: FloatArray, prior: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Fitted:  # fmt: skip
-        """Fit ``deformation`` (3,) in place to the edge and, where given, the found features."""
-        view, k, lines = self.view, basis.shape[1], len(self.clocks_rad)
-        edge_offset, before_sd, edge_at = self._at_benchmark(horizon.line, BESIDE if horizon.is_by_hand else 0)
-        edge = (horizon.points_px, light_columns(view, horizon), np.hypot(horizon.sd_px, before_sd), edge_offset)
-        # one that is not found has an infinite sd, and no weight
-        found, features = 0, _NO_FEATURES
-        if place is not None:
-            there, before_sd, at = self._every_place_at_benchmark
-            sd, painted, found = np.hypot(place[1], before_sd[lines:]), self.features, len(found_rows(place))
-            features = (painted.points_shell_m, painted.across_px, place[0], sd, there[lines:], self._waves)
-            edge_at = np.concatenate([edge_at, at[lines:]])
-        prior = prior or self._shape_prior(k)
-        count = len(edge_at)
-        residual, left, weight = np.empty((3, count))
-        rows, shape = np.zeros((count, 16)), np.zeros((count, _fit_kernels.SHAPES))
-        least = least_points(horizon)
-        limits = (HUBER, OUTLIER_PX, LAST_STEP_RAD, STEPS, 0 if found >= LEAST_FEATURES else least)
-        state, number = _fit_kernels.fit_frame(
-            deformation, np.ascontiguousarray(basis), view.shell_terms, view.camera.lens_terms, edge, features, prior,
-            limits, residual, rows, shape, weight, left,
+    ``shell``: clocking angles of the edge, circles whose limb it is (`flightmodel.geometry.edge_circles`), ring about
+    which the shell flattens, distance of the outermost torus from it, joint station. ``edge``: points (m, 2), light
+    (m, 3), sd and residual at the benchmark (m,), NaN where it was not found. ``features``: points of the shell (p, 3),
+    directions (p, 2), places, sd, infinite where one was not found, residuals there (p,), waves round the shell there
+    (p, 12). ``prior``: mean and sd of flattening, joint, lobes (12), light (3). ``limits``: Huber's, largest residual,
+    last step, steps, fewest edge points. ``residual``: against the deformed shell without lobes; ``left``: with what
+    the fit makes of them, of joint and light. Rows with weight zero were not used; edge points come first.
+    """
+    clocks, circles, ring, width, joint = shell
+    found, light, edge_sd, edge_offset = edge
+    spots, across, place, feature_sd, feature_offset, waves = features
+    m, p, k = len(found), len(spots), basis.shape[1]
+    n = k + 2 + SHAPES
+    points, pixels = np.empty((len(clocks), 3)), np.empty((len(clocks), 2))
+    jacobian = np.empty((len(clocks), 2, COLUMNS))
+    spot_pixels, spot_jacobian = np.empty((p, 2)), np.empty((p, 2, COLUMNS))
+    kept, at = np.empty(len(clocks)), np.empty(m)
+    rotation, columns = np.empty((3, 3)), np.empty((3, 2))
+    scaled = np.empty(max(m, p))
+    room = np.empty((n + 1, m + p)), np.empty(m + p), np.empty(m + p)
+    normal, right = np.empty((n + 1, n + 1)), np.empty(n)
+    form = np.zeros(1 + SHAPES)
+    huber, outlier, last_step, steps, fewest = limits
+    for taken in range(steps):
+        rotation_of(deformation[0], deformation[1], rotation, columns)
+        terms = (rotation, columns, joint, deformation[2], ring[0], ring[1])
+        if m > 0:
+            count = project_edge(deformation, clocks, circles, ring, joint, lens, terms, points, pixels, jacobian, kept)
+            if count < 2:
+                return TOO_FEW, taken
+            _edge_residuals(found, light, edge_offset, width, pixels, jacobian, kept, count, residual, rows, shape, at)
+        _feature_residuals(
+            spots, across, place, feature_sd, feature_offset, waves, terms, lens, outlier, m, spot_pixels,
+            spot_jacobian, residual, rows, shape,
         )  # fmt: skip
-        if state == _fit_kernels.TOO_FEW:
-            raise NoFitError(
-                f"{number} edge points also found at the benchmark where {least} are needed",
-                "edge-points-too-few",
-            )
-        if state == _fit_kernels.DIVERGED:
-            raise NoFitError("the fit diverged beyond 28 deg", "fit-diverged")
-        return Fitted(residual, left, rows, shape, weight, edge_at, len(edge_offset))
-
-    def _solve(
-        self, horizon: HorizonLine, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray,
-        basis: FloatArray, worst_rms_px: float, prior: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Solution:  # fmt: skip
-        """Fit as `_fit_points`, with its covariance; `NoFitError` where the residuals are too large."""
-        k = basis.shape[1]
-        _, sd = prior = prior or self._shape_prior(k)
-        found = self._fit_points(horizon, place, deformation, basis, prior)
-        n, width = len(found.weight), k + len(sd)
-        columns, at, rows = np.empty((n, width)), np.empty(n, dtype=np.intp), np.empty((n, found.rows.shape[1]))
-        residual, weight = np.empty((2, n))
-        count, square = _fit_kernels.used_points(
-            np.ascontiguousarray(basis), found.rows, found.shape, found.residual_px, found.left_px, found.weight,
-            columns, (at, rows, residual, weight),
-        )  # fmt: skip
-        least = min(least_points(horizon), LEAST_FEATURES)
-        if count < least:
-            raise NoFitError(
-                f"{count} edge points and features agree with one deflection where {least} are needed",
-                "edge-points-too-few",
-            )
-        rms = float(np.sqrt(square))
-        if rms > worst_rms_px:
-            raise NoFitError(
-                f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed", "edge-not-shell"
-            )
-        columns, at, rows = columns[:count], at[:count], rows[:count]
-        residual, weight = residual[:count], weight[:count]
-        formal, step = np.empty((width, width)), np.empty(width)
-        _fit_kernels.solved(columns, residual, weight, prior, float(deformation[2]), formal, step)
-        before = self.benchmark_residuals.rows[found.benchmark_at[at]]
-        edge_count = int(np.searchsorted(at, found.edge_points))
-        # the flattening's value was carried from step to step, the others are counted from zero in each
-        shape_found = step[k:]
-        shape_found[0] += deformation[2]
-        return Solution(
-            (formal @ columns.T) * weight,
-            formal,
-            shape_found,
-            columns,
-            rows,
-            before,
-            edge_count,
-            rms,
-            residual,
-            weight,
-            at[edge_count:] - found.edge_points,
-        )
-
-    @cached_property
-    def _light_shift(self) -> FloatArray:
-        """Of rows (n, 3), painted features: texture leaves out what the light may shift, and an analyst sees marks."""
-        painted = np.arange(len(self.features.across_px)) < self.painted_rows
-        return np.where(painted[:, None], light_shift(self.view, self.features), 0.0)
-
-    def _edge_step(self, both: Solution, flattening_rad: float) -> tuple[FloatArray, Solution]:
-        """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
-        edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
-        design, weight = both.columns[edge], both.weight[edge]
-        formal, step = np.empty_like(both.formal), np.empty(len(both.formal))
-        _fit_kernels.solved(design, both.residual_px[edge], weight, (mean, sd), flattening_rad, formal, step)
-        # features that contradict the edge leave it residuals that are none of its scatter
-        left = both.residual_px[edge] - design @ step
-        scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
-        # of the deflection's own rows alone, which is all that is asked of it
-        alone = replace(
-            both, gain=(formal[:2] @ design.T) * weight, formal=np.asarray(min(scatter, 1.0) * formal),
-            rows=both.rows[edge], before=both.before[edge], feature_rows=both.feature_rows[:0],
-        )  # fmt: skip
-        return step[:2], alone
-
-    def _answer(
-        self, horizon: HorizonLine, deformation: FloatArray, last: Solution, basis: FloatArray, moved_var: float
-    ) -> FrameFit:
-        k, by_camera = basis.shape[1], last.by_pose
-        by_benchmark = last.by_deflection + by_camera @ self.posed_per_deflection
-        features, shape, leak = len(last.feature_rows), None, 0.0
-        light = np.sqrt(2.0) * self.apriori.features_px * self._light_shift[last.feature_rows]  # of two frames
-        by_light = last.gain[:, last.edge_count :] @ light
-        covariance = self.covariance_of(last.formal[:k, :k], by_camera[:k], by_benchmark[:k])
-        covariance = covariance + by_light[:k] @ by_light[:k].T
-        if k == 1:
-            spread = last.gain[:1] @ last.columns[:, 1:] * self._shape_sd
-            covariance = covariance + spread @ spread.T
-            # a plane grows by +90 deg as its axis rotates from (y, z) to (-z, y)
-            leak = float(last.gain[0] @ last.rows[:, DEFLECTION] @ np.array([-basis[1, 0], basis[0, 0]]))
-        else:
-            found = np.concatenate([deformation[:2], last.shape_found[SHAPE - 2]])
-            parts = (part[_ANSWERED] for part in (by_camera, by_benchmark, by_light))
-            shape = FrameShape(found, last.formal[_ANSWERED[:, None], _ANSWERED], *parts)
-            covariance = covariance + moved_var * np.eye(2)
-        answer, flattening = basis @ (basis.T @ deformation[:2]), float(deformation[2])
-        return FrameFit(
-            answer, covariance, by_benchmark[:k], leak, flattening, last.rms_px, features, horizon, shape=shape,
-            moved_var=moved_var,
-        )  # fmt: skip
-
-    def covariance_of(self, formal: FloatArray, by_camera: FloatArray, by_benchmark: FloatArray) -> FloatArray:
-        """Covariance of an answer with that of the camera's pose and of the benchmark frame's deflection."""
-        rest = by_benchmark * self.apriori.benchmark_rad
-        return np.asarray(formal + by_camera @ self.posed_covariance @ by_camera.T + rest @ rest.T)
-
-    @cached_property
-    def _edge_rms_px(self) -> float:
-        """Of the edge in the benchmark frame."""
-        edge = self.benchmark_residuals.residual_px[self._benchmark_edge]
-        return float(np.sqrt(np.mean(edge**2))) if len(edge) else float("inf")
-
-    def _contradiction(self, difference: FloatArray, edge: Solution, both: Solution) -> float:
-        """Chi-square (2) of the difference of two answers, of which one uses a part of the other's points."""
-        camera = edge.by_pose[:2] - both.by_pose[:2]
-        missing = edge.by_deflection[:2] - both.by_deflection[:2]
-        rest = (missing + camera @ self.posed_per_deflection) * self.apriori.benchmark_rad
-        covariance = camera @ self.posed_covariance @ camera.T + rest @ rest.T
-        # of the best answers, the better one's error has no part in the difference
-        covariance += _at_least((edge.formal - both.formal)[:2, :2], _LEAST_VAR)
-        (a, b), (c, d) = covariance.tolist()
-        y, z = difference.tolist()
-        return (d * y * y - (b + c) * y * z + a * z * z) / (a * d - b * c)
+        _without_shape(residual, rows, shape, form, left)
+        edges = huber_weights(m, p, edge_sd, feature_sd, huber, left, scaled, weight)
+        if edges < fewest:
+            return TOO_FEW, edges
+        _normal_equations(basis, deformation[2], prior, residual, rows, shape, weight, room, normal, right)
+        small_cholesky(normal, len(right), normal)
+        small_solve(normal, len(right), right)
+        step = right
+        for j in range(k):
+            deformation[0] += basis[0, j] * step[j]
+            deformation[1] += basis[1, j] * step[j]
+        deformation[2] += step[k]
+        for j in range(1 + SHAPES):
+            form[j] = step[k + 1 + j]
+        if not deformation[0] ** 2 + deformation[1] ** 2 < 0.25:
+            return DIVERGED, taken
+        largest = 0.0
+        for j in range(k + 1):
+            largest = max(largest, abs(step[j]))
+        if largest < last_step:
+            break
+    return DONE, taken + 1
 
 
-def _at_least(matrix: FloatArray, least: float) -> FloatArray:
-    """Symmetric matrix (2, 2) with eigenvalues of no less."""
-    (a, b), (_, d) = matrix.tolist()
-    middle, half = 0.5 * (a + d), float(np.hypot(0.5 * (a - d), b))
-    low, high = max(middle - half, least), max(middle + half, least)
-    # of the middle's own part and of one along the axes
-    share = 0.5 * (high - low) / half if half > 0.0 else 0.0
-    return 0.5 * (high + low) * np.eye(2) + share * (matrix - middle * np.eye(2))
+@kernel
+def solved_step(columns, residual, weight, prior, flattening, formal, found):
+    """Formal covariance (n, n) of a weighted least-squares step and the step ``found`` (n,), with the priors.
+
+    ``columns`` (m, n): derivatives by deflection, flattening, joint, lobes and light. ``prior``: mean and sd of all but
+    the deflection, the flattening's about ``flattening``, which comes on top of the step.
+    """
+    m, n = columns.shape
+    turned, normal = np.empty((n + 1, m)), np.empty((n + 1, n + 1))
+    turn_columns(columns, 0, turned)
+    for i in range(m):
+        turned[n, i] = residual[i]
+    lower_products(turned, m, weight, 0, np.empty(m), normal)
+    _add_prior(prior, flattening, n - len(prior[0]), normal, found)
+    small_cholesky(normal, n, normal)
+    small_solve(normal, n, found)
+    unit = np.empty(n)
+    for a in range(n):
+        unit[:] = 0.0
+        unit[a] = 1.0
+        small_solve(normal, n, unit)
+        for b in range(n):
+            formal[a, b] = unit[b]
+
+
+@kernel
+def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
+    """Move what belongs to points with a weight to the front; their number, and the weighted square of ``left``.
+
+    ``columns`` (n, k + 17): derivatives by deflection, flattening, joint, lobes and light. ``of_used``: places of the
+    points, their rows (n, 16), residuals and weights.
+    """
+    at, used_rows, used_residual, used_weight = of_used
+    k, count, square, total = basis.shape[1], 0, 0.0, 0.0
+    for i in range(len(weight)):
+        if weight[i] > 0.0:
+            at[count] = i
+            for j in range(k):
+                columns[count, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
+            columns[count, k], columns[count, k + 1] = rows[i, 2], rows[i, JOINT]
+            for j in range(SHAPES):
+                columns[count, k + 2 + j] = shape[i, j]
+            for j in range(COLUMNS):
+                used_rows[count, j] = rows[i, j]
+            used_residual[count], used_weight[count] = residual[i], weight[i]
+            square += weight[i] * left[i] * left[i]
+            total += weight[i]
+            count += 1
+    return count, square / total if total > 0.0 else 0.0

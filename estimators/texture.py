@@ -41,9 +41,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from estimators import _texture_kernels
 from estimators.features import ImageFeatures
 from estimators.virtual_camera import VirtualCamera, meets_centerbody
+from flightmodel._kernels import inlined, kernel
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.geometry import circumferential, torus_circles
 from flightmodel.rendering import Rendered, against, face_normals
@@ -141,6 +141,85 @@ def band_passed(image: Image) -> Picture:
     return fine - coarse
 
 
+@inlined
+def correlations(picture, template, middle, affine, reach, score):
+    """Correlation (2 reach + 1, 2 reach + 1), rows by v, of a template shifted in its own picture; False outside.
+
+    ``affine`` (2, 2) maps offsets in the template's picture to this one, about ``middle`` (2,). The template (m, m) has
+    mean zero and norm one.
+    """
+    size = len(template)
+    half = size // 2 + reach
+    wide = 2 * half + 1
+    h, w = picture.shape
+    window = np.empty((wide, wide))
+    for i in range(wide):
+        for j in range(wide):
+            u = middle[0] + affine[0, 0] * (j - half) + affine[0, 1] * (i - half)
+            v = middle[1] + affine[1, 0] * (j - half) + affine[1, 1] * (i - half)
+            if not (u >= 0.0 and v >= 0.0 and u < w - 1.0 and v < h - 1.0):
+                return False
+            x, y = int(u), int(v)
+            a, b = u - x, v - y
+            upper = (1.0 - a) * picture[y, x] + a * picture[y, x + 1]
+            window[i, j] = (1.0 - b) * upper + b * ((1.0 - a) * picture[y + 1, x] + a * picture[y + 1, x + 1])
+    # sums over the patch: along rows, then of rows
+    steps = 2 * reach + 1
+    along = np.zeros((wide, steps, 2))
+    for i in range(wide):
+        for q in range(steps):
+            for j in range(size):
+                along[i, q, 0] += window[i, q + j]
+                along[i, q, 1] += window[i, q + j] * window[i, q + j]
+    for p in range(steps):
+        for q in range(steps):
+            spread, product = 0.0, 0.0
+            for i in range(size):
+                spread += along[p + i, q, 1] - along[p + i, q, 0] * along[p + i, q, 0] / size
+                for j in range(size):
+                    product += window[p + i, q + j] * template[i, j]
+            score[p, q] = product / math.sqrt(spread) if spread > 1e-9 else 0.0
+    return True
+
+
+@kernel
+def find_patches(picture, templates, middle, affine, across, limits, place, sd):
+    """Place (n, 2) of each patch along its two directions and its sd, infinite where it was not found.
+
+    ``across`` (n, 2, 2): unit vectors, one a row. ``limits``: reach, least correlation, independent samples of a patch.
+    """
+    reach, least, samples = limits
+    wide = 2 * reach + 1
+    score = np.empty((wide, wide))
+    for k in range(len(templates)):
+        place[k, 0] = place[k, 1] = 0.0
+        sd[k, 0] = sd[k, 1] = np.inf
+        if not correlations(picture, templates[k], middle[k], affine[k], reach, score):
+            continue
+        best = int(np.argmax(score))
+        p, q = best // wide, best % wide
+        if p < 1 or q < 1 or p > wide - 2 or q > wide - 2 or score[p, q] < least:
+            continue
+        # parabola through the nine highest: slope and curvature
+        su, sv = 0.5 * (score[p, q + 1] - score[p, q - 1]), 0.5 * (score[p + 1, q] - score[p - 1, q])
+        cuu = 2.0 * score[p, q] - score[p, q + 1] - score[p, q - 1]
+        cvv = 2.0 * score[p, q] - score[p + 1, q] - score[p - 1, q]
+        cuv = -0.25 * (score[p + 1, q + 1] - score[p + 1, q - 1] - score[p - 1, q + 1] + score[p - 1, q - 1])
+        det = cuu * cvv - cuv * cuv
+        if cuu <= 0.0 or det <= 1e-6:
+            continue
+        du, dv = (cvv * su - cuv * sv) / det, (cuu * sv - cuv * su) / det
+        du, dv = min(max(du, -1.0), 1.0) + q - reach, min(max(dv, -1.0), 1.0) + p - reach
+        rho = min(score[p, q], 0.999)
+        noise = (1.0 - rho * rho) / (rho * samples * det)
+        for r in range(2):
+            # the direction in the template's picture
+            mu = across[k, r, 0] * affine[k, 0, 0] + across[k, r, 1] * affine[k, 1, 0]
+            mv = across[k, r, 0] * affine[k, 0, 1] + across[k, r, 1] * affine[k, 1, 1]
+            place[k, r] = across[k, r, 0] * middle[k, 0] + across[k, r, 1] * middle[k, 1] + mu * du + mv * dv
+            sd[k, r] = math.sqrt(noise * (cvv * mu * mu - 2.0 * cuv * mu * mv + cuu * mv * mv))
+
+
 @dataclass(frozen=True)
 class TrackedTexture:
     """Patches of the benchmark frame, two rows each: the directions in which a patch's place is sharp and less sharp.
@@ -177,7 +256,7 @@ class TrackedTexture:
         samples = (2 * HALF_PX + 1) ** 2 / _INDEPENDENT_PX
         limits = (reach_px, _LEAST_CORRELATION, samples)
         across = self.across_px.reshape(-1, 2, 2)
-        _texture_kernels.find_patches(band_passed(image), self.templates, middle, affine, across, limits, place, sd)
+        find_patches(band_passed(image), self.templates, middle, affine, across, limits, place, sd)
         sd[sd[:, 1] > _LINE * sd[:, 0], 1] = np.inf
         return place.ravel(), np.hypot(sd.ravel(), _SD_FLOOR_PX)
 
@@ -317,14 +396,14 @@ class _Grid:
         """
         h, w = self.shape
         torus = self.seen.torus.reshape(self.steps).astype(np.float32)
-        kernel = np.ones((2 * (-(-HALF_PX // _GRID_PX)) + 1,) * 2, np.uint8)
-        same = (cv2.erode(torus, kernel) == cv2.dilate(torus, kernel)) & (torus >= 0.0)
+        about = np.ones((2 * (-(-HALF_PX // _GRID_PX)) + 1,) * 2, np.uint8)
+        same = (cv2.erode(torus, about) == cv2.dilate(torus, about)) & (torus >= 0.0)
         if view.undeflected is not None:
             away = np.linalg.norm(self.seen.points_shell_m - view.camera.position_body_m, axis=1).reshape(self.steps)
             whole = _spread(away, np.ones((3, 3), np.uint8)) < _STEP_IN_DEPTH * away
-            same &= cv2.erode(whole.astype(np.uint8), kernel) > 0
+            same &= cv2.erode(whole.astype(np.uint8), about) > 0
             for part in self.seen.normals.T:
-                same &= _spread(part.reshape(self.steps), kernel) < _VALLEY
+                same &= _spread(part.reshape(self.steps), about) < _VALLEY
         mask = cv2.resize(same.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST)
         margin = HALF_PX + _BORDER_PX
         out = np.zeros(self.shape, dtype=np.bool_)
@@ -332,10 +411,10 @@ class _Grid:
         return out
 
 
-def _spread(picture: FloatArray, kernel: NDArray[np.uint8]) -> FloatArray:
+def _spread(picture: FloatArray, about: NDArray[np.uint8]) -> FloatArray:
     """Largest less smallest value (h, w) about each place."""
     grey = picture.astype(np.float32)
-    return np.asarray(cv2.dilate(grey, kernel) - cv2.erode(grey, kernel), dtype=float)
+    return np.asarray(cv2.dilate(grey, about) - cv2.erode(grey, about), dtype=float)
 
 
 def _spread_corners(image: Image, picture: Picture, mask: BoolArray, cell_px: int) -> NDArray[np.int64]:

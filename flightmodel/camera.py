@@ -40,6 +40,7 @@ BoolArray = NDArray[np.bool_]
 Lens = Literal["fisheye", "pinhole"]
 LensTerms = tuple[int, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 LENSES: tuple[Lens, ...] = ("fisheye", "pinhole")
+FISHEYE = LENSES.index("fisheye")
 
 WIDEST_HALF_ANGLE_RAD = float(np.deg2rad(89.0))
 """OpenCV projects through X/Z, so a point must lie in front of the camera."""
@@ -97,7 +98,7 @@ class Camera:
 
     @cached_property
     def lens_terms(self) -> tuple[int, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """What a compiled projection wants: see `estimators._sight_kernels.project_shell`."""
+        """What compiled projections want: model, half field, focal, centre, coefficients (5), position and axes."""
         axes, model = np.ascontiguousarray(self.dcm_cam_body), LENSES.index(self.lens)
         coefficients = _five(self.distortion)
         return model, self.half_field_rad, self.focal_px, self.centre_px, coefficients, self.position_body_m, axes

@@ -117,13 +117,13 @@ def _smoothers() -> None:
 
 
 def _balance() -> None:
-    from estimators import _balance_kernels as kernels
+    from estimators import balance
 
     vehicle, one, rows = _vehicle_at_rest()[0], np.ones(1), np.zeros((1, 3))
     common = rows, rows, np.zeros((1, 2)), one, one, vehicle.aero.mach, vehicle.aero.coefficients, np.empty((1, 2))
-    kernels.force_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), rows, *common)
-    kernels.axial_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), rows, *common)
-    kernels.moment_left(np.ones(kernels.COUNT), np.zeros((3, 1, 2)), one, *common)
+    balance.force_left(np.ones(balance.VEHICLE_NUMBERS), np.zeros((3, 1, 2)), rows, *common)
+    balance.axial_left(np.ones(balance.VEHICLE_NUMBERS), np.zeros((3, 1, 2)), rows, *common)
+    balance.moment_left(np.ones(balance.VEHICLE_NUMBERS), np.zeros((3, 1, 2)), one, *common)
 
 
 def _spans() -> None:

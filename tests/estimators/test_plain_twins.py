@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from estimators import _edge_kernels, _fit_kernels, _sight_kernels, _texture_kernels
+from estimators.body_edge import first_lasting_steps
 from estimators.edge import (
     EDGE_BASES,
     EDGE_HALF,
@@ -19,14 +19,22 @@ from estimators.edge import (
     STEP_PX,
     WHOLE_BLUR_PX,
     ScanLines,
+    first_rises,
+    fit_steps,
     is_coherent,
+    sample_lines,
+    sky_levels,
     steps_near,
 )
-from estimators.frame_residuals import waves_round
-from estimators.virtual_camera import VirtualCamera
-from flightmodel import _raster_kernels
+from estimators.features import dark_centres
+from estimators.frame_checks import motion_beside
+from estimators.frame_residuals import huber_weights, waves_round
+from estimators.frame_solution import DONE, SHAPES, fit_frame
+from estimators.texture import correlations, find_patches
+from estimators.virtual_camera import VirtualCamera, feet, limb_points
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_clock, lv_direction
+from flightmodel.rendering import fill
 from tests.oracles import plain_fit, plain_horizon, plain_sight
 
 from .conftest import VEHICLE
@@ -127,7 +135,7 @@ def test_edge_of_a_torus_is_where_sight_touches_it():
     eye, ring, flat = np.array([-1.4, 0.25, -0.1]), (0.25, 0.3), 0.03
     clocks = np.deg2rad([10.0, 95.0, 250.0])
     points = np.empty((3, 3))
-    assert _sight_kernels.limb(circles, ring, flat, eye, clocks, points)
+    assert limb_points(circles, ring, flat, eye, clocks, points)
     aft, out = circles[:, 0] - ring[0], circles[:, 1] - ring[1]
     opened = np.column_stack([circles[:, 0] + flat * out, circles[:, 1] - flat * aft, circles[:, 2]])
     one_by_one = [plain_sight.limb(circle, eye, clocks[k : k + 1])[0] for k, circle in enumerate(opened)]
@@ -139,7 +147,7 @@ def test_distance_from_an_edge_has_a_side_and_a_foot():
     line = np.column_stack([100.0 + 200.0 * t, 50.0 + 30.0 * np.sin(3.0 * t)])
     found = np.array([[140.0, 60.0], [201.3, 90.0], [251.0, 50.0]])
     residual, rows, at = np.empty(3), np.empty((3, 16)), np.empty(3)
-    _sight_kernels.feet_on_edge(found, line, np.zeros((31, 2, 16)), residual, rows, at)
+    feet(found, line, np.zeros((31, 2, 16)), residual, rows, at)
     for point, r, foot in zip(found, residual, at, strict=True):
         away, where = plain_sight.distance_from_line(point, line)
         assert abs(r) == pytest.approx(away, rel=1e-9)
@@ -172,13 +180,11 @@ def near_steps(places):
         image = smoothed(scene(place, 0.0, seed))
         origin, inward = np.array([[40.0, 30.0]]), np.array([[0.0, 1.0]])
         grey, inside = np.empty((1, len(NEAR_ALONG))), np.empty((1, len(NEAR_ALONG)), dtype=np.bool_)
-        _edge_kernels.sample_lines(
-            image, origin, inward, NEAR_ALONG[0], STEP_PX, np.zeros(2), np.array([80.0, 60.0]), grey, inside
-        )
+        sample_lines(image, origin, inward, NEAR_ALONG[0], STEP_PX, np.zeros(2), np.array([80.0, 60.0]), grey, inside)
         plain = plain_horizon.grey(image, np.full(len(NEAR_ALONG), 40.0), 30.0 + NEAR_ALONG)
         np.testing.assert_allclose(grey[0], plain, atol=1e-4)
         place_px, along, left, good = np.zeros(1), np.zeros(1), np.zeros_like(grey), np.zeros(1, dtype=np.bool_)
-        _edge_kernels.steps_near(grey, inside, 0.3, 8.0, NEAR_PLACES, NEAR_BASES, place_px, along, left, good)
+        fit_steps(grey, inside, 0.3, 8.0, NEAR_PLACES, NEAR_BASES, place_px, along, left, good)
         assert good[0]
         profile = grey[0] - np.median(grey[0, :6])
         best, curvature, rest = plain_horizon.best_place(profile, NEAR_PLACES, NEAR_BASES)
@@ -206,11 +212,11 @@ def first_rises_in(picture, noise):
     grey, inside = np.empty((n, m)), np.empty((n, m), dtype=np.bool_)
     height, width = picture.shape
     size = np.array([width, height], dtype=float)
-    _edge_kernels.sample_lines(image, origin, inward, -29.0, STEP_PX, np.zeros(2), size, grey, inside)
+    sample_lines(image, origin, inward, -29.0, STEP_PX, np.zeros(2), size, grey, inside)
     level, scatter, first = np.empty(n), np.empty(n), np.empty(n, dtype=np.int64)
-    _edge_kernels.sky_levels(grey, inside, 12, level, scatter, first)
+    sky_levels(grey, inside, 12, level, scatter, first)
     place, sd, good = np.zeros(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    _edge_kernels.first_rises(
+    first_rises(
         grey, inside, level, first, noise, float(np.median(level)), (12, 6, 8.0), STEP_PX, EDGE_PLACES, EDGE_BASES,
         place, sd, good,
     )  # fmt: skip
@@ -278,7 +284,7 @@ def centres(images, noise, sign=1.0):
     out = []
     for image in images:
         offset, sd = np.zeros(1), np.full(1, np.inf)
-        _edge_kernels.dark_centres(
+        dark_centres(
             image, np.array([[30.0, 20.0]]), np.array([[1.0, 0.0]]), 8, np.array([4]), np.array([sign]), noise,
             offset, sd,
         )  # fmt: skip
@@ -302,9 +308,9 @@ def test_the_first_step_on_a_line_is_the_plain_one(top):
     size, count = np.array([80.0, 60.0 + top]), 97
     origin[:, 1] += top
     grey, inside = np.empty((23, count)), np.empty((23, count), dtype=np.bool_)
-    _edge_kernels.sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
+    sample_lines(picture, origin, outward, -24.0, STEP_PX, corner, size, grey, inside)
     limits, place = (12, 4, 8.0, 4.0), np.empty(23)
-    _edge_kernels.first_lasting_steps(grey, inside, limits, place)
+    first_lasting_steps(grey, inside, limits, place)
     expected = plain_horizon.first_lasting_steps(grey, inside, limits)
     np.testing.assert_allclose(place, expected, atol=1e-9)
     assert 0 < np.isnan(place).sum() < 12
@@ -333,7 +339,7 @@ def patch_of(rng):
 def test_correlation_of_a_patch_leaves_out_what_is_the_same_along_its_rows():
     picture, template = patch_of(np.random.default_rng(1))
     reach, score = 4, np.empty((9, 9))
-    assert _texture_kernels.correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
+    assert correlations(picture, template, np.array([34.0, 31.0]), np.eye(2), reach, score)
     expected = np.empty((9, 9))
     for v, u in np.ndindex(9, 9):
         there = picture[22 + v : 33 + v, 25 + u : 36 + u].astype(float)
@@ -342,9 +348,9 @@ def test_correlation_of_a_patch_leaves_out_what_is_the_same_along_its_rows():
     np.testing.assert_allclose(score, expected, atol=1e-6)
     shaded = picture + np.linspace(0.0, 9.0, 60, dtype=np.float32)[:, None] ** 2
     again = np.empty((9, 9))
-    assert _texture_kernels.correlations(shaded, template, np.array([34.0, 31.0]), np.eye(2), reach, again)
+    assert correlations(shaded, template, np.array([34.0, 31.0]), np.eye(2), reach, again)
     np.testing.assert_allclose(again, score, atol=1e-5)
-    assert not _texture_kernels.correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
+    assert not correlations(picture, template, np.array([3.0, 31.0]), np.eye(2), reach, score)
 
 
 def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
@@ -357,7 +363,7 @@ def test_a_patch_is_found_between_pixels_through_the_map_that_predicts_it():
         maps = [(back[..., k] + (32.0, 29.0)[k]).astype(np.float32) for k in (0, 1)]
         frame = cv2.remap(picture, *maps, cv2.INTER_CUBIC)
         place, sd = np.empty((1, 2)), np.empty((1, 2))
-        _texture_kernels.find_patches(
+        find_patches(
             frame, template[None], np.array([[32.0, 29.0]]), turn[None], np.eye(2)[None], (3, 0.8, 14.0), place, sd
         )
         # a small window's own energy changes as it is shifted, which moves a parabola's top by a tenth of a pixel
@@ -407,12 +413,12 @@ def fitted(view, edge, marks, prior, start):
     out = (
         np.empty(count),
         np.zeros((count, 16)),
-        np.zeros((count, _fit_kernels.SHAPES)),
+        np.zeros((count, SHAPES)),
         np.empty(count),
         np.empty(count),
     )
     limits = (1.5, 12.0, 1e-9, 30, 4)
-    state, _ = _fit_kernels.fit_frame(
+    state, _ = fit_frame(
         bending,
         np.eye(2),
         view.shell_terms,
@@ -423,7 +429,7 @@ def fitted(view, edge, marks, prior, start):
         limits,
         *out,
     )
-    assert state == _fit_kernels.DONE
+    assert state == DONE
     return bending, out
 
 
@@ -454,7 +460,7 @@ def test_the_fit_is_the_most_probable_one():
         m = len(edge[0])
         line = view.edge(bending)
         r, j, at = np.empty(m), np.empty((m, 16)), np.empty(m)
-        _sight_kernels.feet_on_edge(edge[0], line.pixels, line.jacobian, r, j, at)
+        feet(edge[0], line.pixels, line.jacobian, r, j, at)
         rows.append(r - edge[3])
         sight = view.sight(marks[0], bending)
         rows.append(marks[2] - np.einsum("ni,ni->n", sight.pixels, marks[1]))
@@ -476,7 +482,7 @@ def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
     residual, weight = rng.normal(size=61), rng.random(61)
     formal = np.linalg.inv((columns.T * weight) @ columns + np.diag(rng.random(19)))
     motion = np.empty(terms)
-    square = _fit_kernels.motion_beside(columns, formal, by, residual, weight, 0.02, motion)
+    square = motion_beside(columns, formal, by, residual, weight, 0.02, motion)
     expected, expected_square = plain_fit.motion_beside(columns, formal, by, residual, weight, 0.02)
     np.testing.assert_allclose(motion, expected, rtol=1e-7, atol=1e-12)
     assert square == pytest.approx(expected_square, rel=1e-8, abs=1e-12)
@@ -486,7 +492,7 @@ def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
 def test_large_residuals_pull_no_harder_than_huber_lets_them():
     residual = np.array([0.1, -0.2, 0.15, -0.1, 0.05, 8.0, np.nan])
     weight, scaled = np.empty(7), np.empty(7)
-    edges = _fit_kernels.huber_weights(7, 0, np.full(7, 0.2), np.empty(0), 1.5, residual, scaled, weight)
+    edges = huber_weights(7, 0, np.full(7, 0.2), np.empty(0), 1.5, residual, scaled, weight)
     assert edges == 6
     assert weight[6] == 0.0
     scale = 1.0 / np.sqrt(weight[0])
@@ -498,7 +504,7 @@ def test_large_residuals_pull_no_harder_than_huber_lets_them():
 def test_distances_are_linear_between_a_triangle_s_corners():
     depth, nearest = np.full((20, 30), np.inf), np.full((20, 30), -1)
     corners, away = np.array([[3.0, 2.0], [25.0, 4.0], [8.0, 17.0]]), [5.0, 9.0, 14.0]
-    _raster_kernels.fill(*corners.ravel(), *away, 4, depth, nearest)
+    fill(*corners.ravel(), *away, 4, depth, nearest)
     hit = nearest == 4
     plane = np.linalg.solve(np.column_stack([corners, np.ones(3)]), away)
     v, u = np.indices(depth.shape)

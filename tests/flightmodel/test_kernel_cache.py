@@ -44,7 +44,7 @@ def test_an_edit_of_any_file_with_kernels_leaves_the_old_cache_behind(tmp_path):
     assert after != before
     assert changed == value + 1.0
     # any file with kernels counts, as its constants may be frozen into the machine code of others
-    layout = tree / "flightmodel" / "_raster_kernels.py"
+    layout = tree / "flightmodel" / "rendering.py"
     layout.write_text(layout.read_text() + "\n# moved\n")
     assert run(tree, cache)[0] not in (before, after)
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from estimators.frame_residuals import edge_residuals, feature_residuals, huber_gain, joined
-from estimators.frame_solution import JOINT, LAST_STEP_RAD, OUTLIER_PX, STEPS
-from estimators.virtual_camera import DEFLECTION, FLATTENING
+from estimators.frame_solution import LAST_STEP_RAD, OUTLIER_PX, STEPS
+from estimators.virtual_camera import DEFLECTION, FLATTENING, JOINT
 
 
 def plain_fit(oriented, horizon, place, start):
