@@ -1,4 +1,4 @@
-"""What do sensors on flown spans read, and where do spans stand in the normal equations? Compiled loops."""
+"""What do sensors on flown spans read? Compiled loops."""
 
 from __future__ import annotations
 
@@ -37,20 +37,3 @@ def sense(states, aux, vehicle, arms, masses, simpson, window_s, windows, slope)
                     total += simpson[k] * records[first + k, j]
                 windows[i, w, j] = total
                 slope[i, w, j] = (records[first + intervals, j] - records[first, j]) / window_s
-
-
-@kernel
-def add_part(corner, across, band, place, part):
-    """Add a symmetric part (k, k) at rows and columns ``place`` (k,) of an arrow matrix in its three pieces."""
-    shared = len(corner)
-    for i in range(len(place)):
-        row = place[i]
-        for j in range(len(place)):
-            column = place[j]
-            if row < shared:
-                if column < shared:
-                    corner[row, column] += part[i, j]
-            elif column < shared:
-                across[row - shared, column] += part[i, j]
-            elif row >= column:
-                band[row - column, column - shared] += part[i, j]
