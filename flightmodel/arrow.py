@@ -63,16 +63,6 @@ class Arrow:
         band[row - column, :, column] = blocks[:, row, column].T
         return cls(band.reshape(2 * size, -1), across, corner)
 
-    def add(self, at: IntArray, part: FloatArray) -> None:
-        """Add a full symmetric part (k, k) at rows and columns (k,), each at most once, within the band."""
-        n = len(self.across)
-        inner, border = np.flatnonzero(at < n), np.flatnonzero(at >= n)
-        self.corner[np.ix_(at[border] - n, at[border] - n)] += part[np.ix_(border, border)]
-        self.across[np.ix_(at[inner], at[border] - n)] += part[np.ix_(inner, border)]
-        row, column = np.nonzero(at[inner, None] >= at[inner])
-        first = at[inner[column]]
-        self.band[at[inner[row]] - first, first] += part[inner[row], inner[column]]
-
     def columns(self, at: IntArray) -> FloatArray:
         """Columns (n + m, k) of the border, by their numbers in it (k,)."""
         return np.concatenate([self.across[:, at], self.corner[:, at]])

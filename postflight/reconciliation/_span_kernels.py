@@ -1,4 +1,4 @@
-"""What do sensors on flown spans read? Compiled loops."""
+"""What do sensors on flown spans read, and where do spans stand in the normal equations? Compiled loops."""
 
 from __future__ import annotations
 
@@ -37,3 +37,18 @@ def sense(states, aux, vehicle, arms, masses, simpson, window_s, windows, slope)
                     total += simpson[k] * records[first + k, j]
                 windows[i, w, j] = total
                 slope[i, w, j] = (records[first + intervals, j] - records[first, j]) / window_s
+
+
+@kernel
+def add_part(band, across, corner, place, part):
+    """Add a symmetric part (k, k) at rows and columns ``place`` (k,) of a `flightmodel.arrow.Arrow`'s three pieces."""
+    n = len(across)
+    for i, row in enumerate(place):
+        for j, column in enumerate(place):
+            if column >= n:
+                if row >= n:
+                    corner[row - n, column - n] += part[i, j]
+                else:
+                    across[row, column - n] += part[i, j]
+            elif column <= row < n:
+                band[row - column, column] += part[i, j]

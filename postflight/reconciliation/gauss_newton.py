@@ -26,6 +26,7 @@ import numpy as np
 
 from flightmodel.arrow import Arrow
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
+from postflight.reconciliation import _span_kernels
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
     CREEP,
@@ -389,10 +390,10 @@ class Problem:
         shared, knots, first_air = len(place) + CONSTANT - n, len(self.air.knots_m), self.first_instrument + INSTRUMENTS
         matrix = Arrow(np.zeros((reach + 1, n)), np.zeros((n, shared)), np.zeros((shared, shared)))
         for column, response in (*linear.sensors, *linear.joins):
-            matrix.add(place[column], response.T @ response)
+            _span_kernels.add_part(matrix.band, matrix.across, matrix.corner, place[column], response.T @ response)
         for part, precision, _ in self._priors(u):
             if not first_air <= part.start < self.first_temperature:
-                matrix.add(place[part], precision)
+                _span_kernels.add_part(matrix.band, matrix.across, matrix.corner, place[part], precision)
         for kind, (diagonal, beside, constant) in enumerate(self.air.inverse_covariance):
             at, border = place[first_air + kind * knots :][:knots], shared - CONSTANT + kind
             first, second = np.minimum(at[:-1], at[1:]), np.maximum(at[:-1], at[1:])

@@ -55,15 +55,6 @@ def test_solution_determinant_and_covariances_are_those_of_the_full_matrix(n, m,
     np.testing.assert_allclose(whole, inverse[:n, :n], rtol=1e-8, atol=1e-13)
 
 
-def test_parts_are_added_wherever_they_stand():
-    rng, (arrow, matrix) = np.random.default_rng(8), arrow_of(20, 4, 6)
-    for at in (np.array([3, 22, 8, 20, 5]), np.array([21, 23]), np.array([19, 13, 14])):
-        root = rng.standard_normal((len(at), len(at)))
-        arrow.add(at, root @ root.T)
-        matrix[np.ix_(at, at)] += root @ root.T
-    np.testing.assert_allclose(arrow.dense, matrix, rtol=1e-14)
-
-
 def test_blocks_on_the_diagonal_and_below_are_a_band():
     rng, count, size = np.random.default_rng(9), 5, 3
     own, below = rng.standard_normal((count, size, size)), rng.standard_normal((count - 1, size, size))

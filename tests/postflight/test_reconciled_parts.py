@@ -10,6 +10,7 @@ from flightmodel.arrow import Arrow
 from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from postflight.reconciliation._span_kernels import add_part
 from postflight.reconciliation.command import MOST_MOVED_SD, credibility
 from postflight.reconciliation.fit import CreepScore, JointFit, require_damping, with_freeplay
 from postflight.reconciliation.forward_model import (
@@ -127,7 +128,7 @@ def scattered(place, matrix, m):
     """Arrow of a matrix whose rows stand at ``place`` in it, the last ``m`` places in the border."""
     n = len(place) - m
     arrow = Arrow(np.zeros((n, n)), np.zeros((n, m)), np.zeros((m, m)))
-    arrow.add(place, matrix)
+    add_part(arrow.band, arrow.across, arrow.corner, place, matrix)
     return arrow
 
 
