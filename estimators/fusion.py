@@ -138,11 +138,6 @@ def shares_of_spans(time_s: FloatArray, width_s: float, from_s: float) -> csr_ar
     return csr_array((1.0 / count[which], place), (len(count), len(time_s)))
 
 
-def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
-    """Weights of `shares_of_spans` as a full matrix (bins, n)."""
-    return np.asarray(shares_of_spans(time_s, width_s, from_s).toarray())
-
-
 class Method(Protocol):
     """Reads the deflection at all samples of loads, linear about a deflection; the inputs' responses on demand."""
 

@@ -152,6 +152,7 @@ def test_normal_equations_are_solved_as_full_ones_wherever_the_parameters_stand(
 def test_a_row_more_takes_an_outer_product_from_the_matrix():
     rng, n, m = np.random.default_rng(6), 12, 4
     response, u = rng.standard_normal((40, n)), 0.5 * rng.standard_normal((n, 2))
+    u[0] = 0.0  # what is held is no air
     want = response.T @ response + 2.0 * np.eye(n) - u @ u.T
     # two parameters are first of the border, and after them stand the rows of no parameter
     place = np.concatenate([[10, 11], rng.permutation(10)])
