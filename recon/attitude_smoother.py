@@ -124,11 +124,9 @@ def _head_name(index: int) -> str:
     return f"sun head {index + 1}"
 
 
-def error_terms(
-    magnetometer: TriadSpec, sun: SunHeads, unstated: UnstatedErrors, start_s: float, end_s: float
-) -> ErrorTerms:
+def error_terms(magnetometer: TriadSpec, sun: SunHeads, start_s: float, end_s: float) -> ErrorTerms:
     """Errors of two data sheets and of what they leave out, over a flight from ``start_s`` to ``end_s``."""
-    rows: list[tuple[str, str, str, float]] = []
+    unstated, rows = UnstatedErrors(), list[tuple[str, str, str, float]]()
 
     def add(instrument: str, kind: str, parts: tuple[str, ...], unit: str, sd: float) -> None:
         least = 1e-4 * _LEAST if unit == "T" else _LEAST
@@ -216,10 +214,9 @@ class VectorObservations:
         sensor = self.measured if self.is_field else direction_from_sun_angles(self.measured)
         return unit(sensor @ self.dcm_body_sensor.T)
 
-    def take(self, rows: BoolArray, knot: IntArray | None = None) -> VectorObservations:
-        """Some of the rows; ``knot`` holds their new knot numbers, where these change."""
+    def take(self, rows: BoolArray, number: IntArray) -> VectorObservations:
+        """Some of the rows, with new ``number`` of their knots."""
         names = ("lag_s", "measured", "noise_sd", "reference_eci", "up_eci", "drift")
-        number = self.knot[rows] if knot is None else knot
         return replace(self, knot=number, **{name: getattr(self, name)[rows] for name in names})
 
 
@@ -271,49 +268,34 @@ def observe_magnetometer(
     nodes, sd_of = terms.drift_nodes_s, terms.prior_sd
     # one axis of each kind stands for all; bias and field error rotate a direction by their part of the field
     angle = np.hypot(sd_of[0], sd_of[_FIELD_ERROR]) / max(float(np.median(np.linalg.norm(field, axis=1))), _LEAST)
+    reference, up = (rotations.rotate(turn, x) for x in (magnetic_field_ecef_t(place, t0_utc), unit(place)))
+    drift = np.column_stack([np.interp(at, nodes, share) for share in np.eye(len(nodes))])
+    constant = float(np.linalg.norm([angle, sd_of[3], sd_of[6], sd_of[9]]))
     return VectorObservations(
-        _MAGNETOMETER,
-        spec.dcm_body_sensor,
-        terms.of(_MAGNETOMETER),
-        0.0,
-        knot,
-        at - knots_s[knot],
-        field,
-        sd / np.sqrt(count),
-        rotations.rotate(turn, magnetic_field_ecef_t(place, t0_utc)),
-        rotations.rotate(turn, unit(place)),
-        np.column_stack([np.interp(at, nodes, share) for share in np.eye(len(nodes))]),
-        float(np.linalg.norm([angle, sd_of[3], sd_of[6], sd_of[9]])),
-    )
+        _MAGNETOMETER, spec.dcm_body_sensor, terms.of(_MAGNETOMETER), 0.0, knot, at - knots_s[knot], field,
+        sd / np.sqrt(count), reference, up, drift, constant,
+    )  # fmt: skip
 
 
 def observe_sun(
     record: SunRecord, t0_utc: str, knots_s: FloatArray, step_s: float, position: Position, terms: ErrorTerms
 ) -> list[VectorObservations]:
     """Block means of every Sun head that ever has the Sun in its field."""
-    out, spec = [], record.spec
+    out, spec, edge = [], record.spec, float(np.cos(0.5 * record.spec.field_rad))
+    shared = terms.prior_sd[terms.of(_HEADS)[:2]]
+    constant = float(np.linalg.norm([spec.bias_sd_rad, spec.mount_sd_rad, *shared]))
     for head, dcm in enumerate(spec.dcm_body_head):
         observed = direction_from_sun_angles(record.az_el_head_rad[:, head])
         knot, count, at, mean = _block_means(record.time_s, observed, knots_s, step_s)
         if len(knot) == 0:
             continue
-        turn = rotations.conjugate(earth.q_ecef_eci(at))
-        out.append(
-            VectorObservations(
-                _head_name(head),
-                dcm,
-                terms.of(_head_name(head), _HEADS),
-                float(np.cos(0.5 * spec.field_rad)),
-                knot,
-                at - knots_s[knot],
-                sun_angles_from_direction(mean),
-                max(spec.noise_sd_rad, _LEAST) / np.sqrt(count),
-                rotations.rotate(turn, sun_direction_ecef(t0_utc, at)),
-                rotations.rotate(turn, unit(position(at))),
-                np.empty((len(knot), 0)),
-                float(np.linalg.norm([spec.bias_sd_rad, spec.mount_sd_rad, *terms.prior_sd[terms.of(_HEADS)[:2]]])),
-            )
-        )
+        name, turn = _head_name(head), rotations.conjugate(earth.q_ecef_eci(at))
+        reference, up = (rotations.rotate(turn, x) for x in (sun_direction_ecef(t0_utc, at), unit(position(at))))
+        noise_sd = max(spec.noise_sd_rad, _LEAST) / np.sqrt(count)
+        out.append(VectorObservations(
+            name, dcm, terms.of(name, _HEADS), edge, knot, at - knots_s[knot], sun_angles_from_direction(mean),
+            noise_sd, reference, up, np.empty((len(knot), 0)), constant,
+        ))  # fmt: skip
     return out
 
 
@@ -624,4 +606,4 @@ def _edited(observed: VectorObservations, fit: Fit) -> VectorObservations:
     line = linearise(observed, fit.q_eci_body, fit.rate_radps, fit.errors)
     off = np.abs(line.residual).max(axis=1) / observed.noise_sd
     far = np.asarray(off > _EDIT_SD * max(1.0, NORMAL_MAD * float(np.median(off))))
-    return observed.take(~far) if 0.0 < far.mean() <= _MOST_EDITED else observed
+    return observed.take(~far, observed.knot[~far]) if 0.0 < far.mean() <= _MOST_EDITED else observed
