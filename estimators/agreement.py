@@ -44,6 +44,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,7 +64,7 @@ from estimators.evidence import (
     Evidence,
     offset_sd_m,
 )
-from estimators.fusion import means_over_spans, span_numbers
+from estimators.fusion import shares_of_spans, span_numbers
 from estimators.loads import FlightLoads
 from flightmodel.checks import BoolArray, FloatArray
 
@@ -286,10 +287,10 @@ def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tupl
         sparse, dense = _chosen(sparse, np.isin(of_sparse, of_dense)), _chosen(dense, np.isin(of_dense, of_sparse))
     if not len(sparse.time_s):
         return np.empty(0), np.empty((0, 0))
-    share = means_over_spans(sparse.time_s, SPAN_S, from_s=0.0)
+    share = shares_of_spans(sparse.time_s, SPAN_S, from_s=0.0).toarray()
     dense_share = share @ _between(dense.time_s, sparse.time_s)
     if deflection is not None:
-        dense_share = means_over_spans(dense.time_s, SPAN_S, from_s=0.0)
+        dense_share = shares_of_spans(dense.time_s, SPAN_S, from_s=0.0).toarray()
     d, by_input, noise = _means(sparse, share, deflection)
     other, other_by_input, other_noise = _means(dense, dense_share, deflection)
     none, names = np.zeros((len(d), 2, 1)), dict.fromkeys([*by_input, *other_by_input])
@@ -332,13 +333,7 @@ def _answered(one: Evidence, time_s: FloatArray) -> BoolArray:
 
 def _chosen(one: Evidence, keep: BoolArray) -> Evidence:
     """Evidence of chosen samples (n,)."""
-    return replace(
-        one,
-        time_s=one.time_s[keep],
-        theta_yz_rad=one.theta_yz_rad[keep],
-        by_rate_s=one.by_rate_s[keep],
-        by_acceleration_s2=one.by_acceleration_s2[keep],
-        by_input={name: j[keep] for name, j in one.by_input.items()},
-        independent_cov=one.independent_cov[keep],
-        half_curvature_rad=None,
-    )
+    names = ("time_s", "theta_yz_rad", "by_rate_s", "by_acceleration_s2", "independent_cov")
+    of_rows: dict[str, Any] = {name: getattr(one, name)[keep] for name in names}
+    by_input = {name: j[keep] for name, j in one.by_input.items()}
+    return replace(one, **of_rows, by_input=by_input, half_curvature_rad=None)

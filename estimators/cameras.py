@@ -36,7 +36,6 @@ import pandas as pd
 
 from estimators.agreement import Pair, agreement
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections
-from estimators.deflection_spline import inverse
 from estimators.evidence import (
     CAMERA_PLANE,
     CAMERA_TIME_BIAS,
@@ -327,13 +326,13 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
         anything = np.zeros((len(one.time_s), 2, 2 * len(timed)))
         anything[:, :, 2 * k : 2 * k + 2] = _ANY_OFFSET_RAD * np.eye(2)
         free.append(replace(one, by_input=one.by_input | {_OFFSET: anything}))
-    # all is linear, and what the tests have in common, all but the offset, is integrated over once
     whole = equations_of(free, {}, span_of(free))
-    offsets = whole.without_inputs(whole.place[_OFFSET])
+    offsets = np.arange(whole.place[_OFFSET].start, whole.place[_OFFSET].stop)
+    others = np.setdiff1d(np.arange(len(whole.matrix.corner)), offsets)
     for k, one in enumerate(timed):
-        alone = offsets.with_inputs(slice(2 * k, 2 * k + 2))
-        mean, precision, _ = alone.of_inputs(alone.without_inputs().process_size(), "camera")
-        covariance = inverse(precision)
+        alone = whole.with_inputs(np.concatenate([others, offsets[2 * k : 2 * k + 2]]))
+        answer = alone.solved(alone.process_size(), "camera")
+        mean, covariance = answer.of_inputs[-2:], answer.inputs[-2:, -2:]
         if np.trace(covariance) < 2.0 - _LEAST_INFORMATION:  # else nothing connects it with the others
             square = float(mean @ np.linalg.solve(covariance, mean))
             out.append(Pair((one.method.removeprefix("camera "),), square, 2))

@@ -2,13 +2,11 @@
 
 The deflection's lateral vector is a cubic spline with even knots, of which four basis functions differ from
 zero at a time: rows of the least-squares problem are sparse in its coefficients, and their normal matrix ``N`` is a
-band, whatever the length of the flight. Only the inputs' unit normals ``x`` are dense. With ``C`` the block across and
-``Q`` the process's precision, the inputs' precision and mean are those of the Schur complement
+band, whatever the length of the flight. Only the inputs' unit normals ``x`` are dense: with ``Q`` the process's
+precision, ``C`` the block across and ``X`` that of the inputs, it is an arrow (`flightmodel.arrow`)::
 
-    S = I + X - C' (N + Q)^-1 C,   x = S^-1 (b_x - C' (N + Q)^-1 b),
-
-and the deflection's covariance is ``(N + Q)^-1 + G S^-1 G'`` with ``G = -(N + Q)^-1 C``, its change per unit normal of
-each input.
+    [N + Q    C  ]
+    [C'     I + X]
 """
 
 from __future__ import annotations
@@ -20,11 +18,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular, solveh_banded
-from scipy.linalg.lapack import dpotri
-from scipy.sparse import coo_array, csr_array, dia_array, eye_array, kron
+from scipy.sparse import csr_array, eye_array, kron
 
 from estimators.evidence import Deflection
+from flightmodel.arrow import Arrow, ArrowFactor, lower_band
 from flightmodel.checks import DivergenceError, FloatArray
 
 # longest spacing of knots: a quarter of a joint's period of 0.4 s; knots at half of a period cannot follow it
@@ -65,10 +62,16 @@ class Spline:
         return cls(np.asarray(knots), len(knots) + 2, step_s)
 
     @cached_property
-    def stiffness(self) -> csr_array:
-        """Matrix (2 count, 2 count) of the sum over the knots of both axes' squared second derivatives."""
+    def _stiffness(self) -> FloatArray:
+        """Band of the sum over the knots of both axes' squared second derivatives."""
         curvature = self.rows(self.knots_s, 2)
-        return csr_array(kron(curvature.T @ curvature, eye_array(2)))
+        return lower_band(csr_array(kron(curvature.T @ curvature, eye_array(2))))
+
+    def process_precision(self, size_radps2: float) -> Arrow:
+        """A priori precision of the coefficients, y and z of each knot side by side, by a process of a size."""
+        band = self._stiffness / size_radps2**2
+        band[0] += 1.0 / DEFLECTION_SD_RAD**2
+        return Arrow(band, np.zeros((2 * self.count, 0)), np.zeros((0, 0)))
 
     def at(self, time_s: FloatArray, derivative: int = 0) -> tuple[NDArray[np.int64], FloatArray]:
         """Numbers (n, 4) and values of the basis functions that differ from zero at times (n,), or of derivatives."""
@@ -95,11 +98,14 @@ class Spline:
     def smooth(self, time_s: FloatArray, values: FloatArray) -> FloatArray:
         """Least-squares fit to values (n, c) at times (n,), there; the smallest one where samples are too few."""
         rows = self.rows(time_s)
-        band = upper_band(csr_array(rows.T @ rows))
-        band[-1] += _WITHOUT_SAMPLES * band[-1].max()
-        found = np.zeros((self.count, values.shape[1]))
+        band = lower_band(csr_array(rows.T @ rows))
+        band[0] += _WITHOUT_SAMPLES * band[0].max()
+        factor, found = (
+            Arrow(band, np.zeros((self.count, 0)), np.zeros((0, 0))).factor(),
+            np.zeros((self.count, values.shape[1])),
+        )
         for _ in range(3):  # what the weight takes from coefficients that samples hardly reach
-            found += solveh_banded(band, rows.T @ (values - rows @ found))
+            found += factor.solve(rows.T @ (values - rows @ found))
         return np.asarray(rows @ found)
 
 
@@ -121,19 +127,38 @@ class Solution:
 
     Parameters
     ----------
+    spline : Spline
     mean : (2 m + k,) float
-    own : (2 m, 2 m) float, sparse
-        Covariance of the coefficients, the inputs known; of those that act at one time, no others.
-    by_input : (2 m, k) float
-        Change of the coefficients per unit normal of each input.
+    factor : ArrowFactor
+        Of the normal equations.
     inputs : (k, k) float
         Covariance of the inputs.
     """
 
+    spline: Spline
     mean: FloatArray
-    own: csr_array
-    by_input: FloatArray
+    factor: ArrowFactor
     inputs: FloatArray
+
+    @property
+    def deflection(self) -> Deflection:
+        """Mean lateral vectors (n, 2), from times."""
+        return SplineDeflection(self.spline, self.mean[: 2 * self.spline.count].reshape(-1, 2))
+
+    @property
+    def of_inputs(self) -> FloatArray:
+        """Mean (k,) of the inputs."""
+        return self.mean[2 * self.spline.count :]
+
+    @cached_property
+    def own(self) -> csr_array:
+        """Covariance (2 m, 2 m) of the coefficients that act at one time, the inputs known; of no others."""
+        return self.factor.inverse_near_diagonal()
+
+    @property
+    def by_input(self) -> FloatArray:
+        """Change (2 m, k) of the coefficients per unit normal of each input."""
+        return self.factor.gain
 
     @cached_property
     def sd(self) -> FloatArray:
@@ -179,179 +204,79 @@ class Rows:
 class NormalEquations:
     """Normal equations of the deflection's spline and of the inputs' unit normals, without the process's prior.
 
-    Blocks: ``deflection`` of the spline's coefficients, y and z of each knot side by side, the upper band (w, 2 m) of
-    a matrix; ``across`` (2 m, k); ``inputs`` (k, k), at ``place``. Right-hand sides (2 m,) and (k,).
+    Parameters
+    ----------
+    spline : Spline
+    place : dict of str to slice
+        Of each input's unit normals among all.
+    matrix : Arrow
+        The spline's coefficients, y and z of each knot side by side, as its band; the inputs as its border.
+    right : (2 m + k,) float
     """
 
     spline: Spline
     place: dict[str, slice]
-    deflection: FloatArray
-    across: FloatArray
-    inputs: FloatArray
+    matrix: Arrow
     right: FloatArray
-    right_inputs: FloatArray
 
     @classmethod
     def of_rows(cls, spline: Spline, place: dict[str, slice], parts: Iterable[Rows]) -> NormalEquations:
         """Equations of all rows of the least-squares problem."""
-        total = max((p.stop for p in place.values()), default=0)
-        band, across = csr_array((2 * spline.count,) * 2), np.zeros((2 * spline.count, total))
-        inputs, right, right_inputs = np.eye(total), np.zeros(2 * spline.count), np.zeros(total)
+        total, size = max((p.stop for p in place.values()), default=0), 2 * spline.count
+        band, across = csr_array((size, size)), np.zeros((size, total))
+        inputs, right = np.eye(total), np.zeros(size + total)
         for part in parts:
             turned = part.by_deflection.T
             band = band + turned @ part.by_deflection
             across += turned @ part.by_input
             inputs += part.by_input.T @ part.by_input
-            right += turned @ part.want
-            right_inputs += part.by_input.T @ part.want
-        return cls(spline, place, upper_band(csr_array(band)), across, inputs, right, right_inputs)
+            right += np.concatenate([turned @ part.want, part.by_input.T @ part.want])
+        return cls(spline, place, Arrow(lower_band(csr_array(band)), across, inputs), right)
+
+    def with_inputs(self, columns: NDArray[np.int64]) -> NormalEquations:
+        """Equations with some of the inputs alone, by their columns, the others as stated."""
+        size, whole = 2 * self.spline.count, self.matrix
+        part = Arrow(whole.band, whole.across[:, columns], whole.corner[np.ix_(columns, columns)])
+        return NormalEquations(self.spline, {}, part, np.concatenate([self.right[:size], self.right[size:][columns]]))
 
     def solved(self, size_radps2: float, method: str) -> Solution:
         """Posterior of all unknowns, the process of a size."""
-        factor = self._factor(size_radps2, method)
-        gain = cho_solve_banded((factor, False), self.across)
-        mean, precision, found = self._of_inputs(factor, gain, method)
-        return Solution(np.concatenate([found, mean]), inverse_in_band(factor), -gain, inverse(precision))
+        try:
+            factor = self._factor(size_radps2)
+        except np.linalg.LinAlgError:
+            message = f"{method}: the readings do not determine the deflection"
+            raise DivergenceError(message, code="not-observable") from None
+        return Solution(self.spline, factor.solve(self.right), factor, factor.border_covariance)
 
     def smoothed(self, inputs: InputPosterior, method: str) -> tuple[Solution, float]:
         """Posterior of all unknowns, of inputs found without the process, and the process's size."""
-        given = replace(self, right=self.right - self.across @ inputs.mean)
+        alone, size = self.with_inputs(np.arange(0)), 2 * self.spline.count
+        given = replace(alone, right=self.right[:size] - self.matrix.across @ inputs.mean)
         size_radps2 = given.process_size()
-        factor = self._factor(size_radps2, method)
-        own, by_input = inverse_in_band(factor), -cho_solve_banded((factor, False), self.across)
-        found = cho_solve_banded((factor, False), given.right)
-        return Solution(np.concatenate([found, inputs.mean]), own, by_input, inputs.covariance), size_radps2
-
-    def of_inputs(self, size_radps2: float, method: str) -> tuple[FloatArray, FloatArray, Deflection]:
-        """Posterior mean and precision of the inputs, the deflection integrated over, and the deflection's mean."""
-        factor = self._factor(size_radps2, method)
-        gain = cho_solve_banded((factor, False), self.across)
-        mean, precision, found = self._of_inputs(factor, gain, method)
-        return mean, precision, self.history(found)
-
-    def _of_inputs(
-        self, factor: FloatArray, gain: FloatArray, method: str
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean and precision of the inputs, and the deflection's coefficients."""
-        precision = self.inputs - self.across.T @ gain
-        try:
-            mean = cho_solve(cho_factor(precision), self.right_inputs - gain.T @ self.right)
-        except np.linalg.LinAlgError:
-            raise _undetermined(method) from None
-        return mean, precision, cho_solve_banded((factor, False), self.right - self.across @ mean)
-
-    def without_inputs(self, kept: slice = slice(0)) -> NormalEquations:
-        """Equations of the deflection and the ``kept`` inputs, the others being anything that their priors allow.
-
-        The deflection's block is no band any more.
-        """
-        others = np.delete(np.arange(len(self.inputs)), kept)
-        # half of a solution: its product with itself is what the inputs take, for half the work
-        root = np.linalg.cholesky(self.inputs[np.ix_(others, others)])
-        blocks = self.across[:, others].T, self.inputs[others, kept], self.right_inputs[others]
-        across, inputs, right = (solve_triangular(root, block, lower=True) for block in blocks)
-        full, n = -across.T @ across, len(self.right)
-        band = np.zeros((n, n))
-        for above in range(n):
-            band[n - 1 - above, above:] = np.diagonal(full, above)
-        band[-len(self.deflection) :] += self.deflection
-        return replace(
-            self, place={}, deflection=band, across=self.across[:, kept] - across.T @ inputs,
-            inputs=self.inputs[kept, kept] - inputs.T @ inputs, right=self.right - across.T @ right,
-            right_inputs=self.right_inputs[kept] - inputs.T @ right,
-        )  # fmt: skip
-
-    def with_inputs(self, columns: slice) -> NormalEquations:
-        """Equations with some of the inputs alone, the others as stated."""
-        return replace(
-            self, place={}, across=self.across[:, columns], inputs=self.inputs[columns, columns],
-            right_inputs=self.right_inputs[columns],
-        )  # fmt: skip
+        mean = np.concatenate([given.solved(size_radps2, method).mean, inputs.mean])
+        return replace(self.solved(size_radps2, method), mean=mean, inputs=inputs.covariance), size_radps2
 
     def process_size(self) -> float:
-        """Most probable size of the process, rad/s^2, of the deflection's block alone."""
+        """Most probable size of the process, rad/s^2, deflection and inputs integrated over."""
         from scipy.optimize import minimize_scalar  # a tenth of a second
 
         def surprise(log_size: float) -> float:
             size = float(np.exp(log_size))
-            factor = self._factor(size, "")
-            prior = 0.5 * ((log_size - np.log(SIZE_RADPS2)) / SIZE_LOG_SD) ** 2
-            # a determinant is the square of the product of its Cholesky factor's diagonal, the last row of the band
-            volume = np.log(factor[-1]).sum() - np.log(cholesky_banded(self._prior_band(size))[-1]).sum()
-            return float(prior + volume - 0.5 * self.right @ cho_solve_banded((factor, False), self.right))
+            factor, prior = self._factor(size), self.spline.process_precision(size)
+            a_priori = 0.5 * ((log_size - np.log(SIZE_RADPS2)) / SIZE_LOG_SD) ** 2
+            volume = 0.5 * factor.log_det - 0.5 * prior.factor().log_det
+            return float(a_priori + volume - 0.5 * self.right @ factor.solve(self.right))
 
         found = minimize_scalar(surprise, bounds=np.log(_SIZES_RADPS2), method="bounded", options={"xatol": 0.05})
         return float(np.exp(found.x))
 
-    def mean(self, size_radps2: float, method: str) -> FloatArray:
-        """Posterior mean of the deflection's coefficients alone."""
-        return np.asarray(cho_solve_banded((self._factor(size_radps2, method), False), self.right))
-
-    @cached_property
-    def _stiffness_band(self) -> FloatArray:
-        return upper_band(self.spline.stiffness)
-
-    def _prior_band(self, size_radps2: float) -> FloatArray:
-        """Upper band of the process's precision."""
-        out = self._stiffness_band / size_radps2**2
-        out[-1] += 1.0 / DEFLECTION_SD_RAD**2
-        return out
-
-    def _factor(self, size_radps2: float, method: str) -> FloatArray:
-        """Cholesky factor of the deflection's block with the process's prior, an upper band."""
-        prior = self._prior_band(size_radps2)
-        band = np.zeros((max(len(prior), len(self.deflection)), len(self.right)))
-        band[-len(self.deflection) :] = self.deflection
-        band[-len(prior) :] += prior
-        try:
-            return np.asarray(cholesky_banded(band))
-        except np.linalg.LinAlgError:
-            raise _undetermined(method) from None
-
-    def history(self, found: FloatArray) -> Deflection:
-        """Lateral vectors (n, 2) of a solution, from times."""
-        return SplineDeflection(self.spline, found[: 2 * self.spline.count].reshape(-1, 2))
-
-
-def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a positive definite matrix."""
-    if not len(matrix):
-        return matrix
-    upper = np.triu(dpotri(cho_factor(matrix)[0])[0])
-    return np.asarray(upper + np.triu(upper, 1).T)
-
-
-def inverse_in_band(factor: FloatArray) -> csr_array:
-    """Those elements of a matrix's inverse that lie in the band of its upper Cholesky factor (w + 1, n).
-
-    Row by row from the last, each from the block below it (Takahashi, Fagan, Chen, 1973): the work of the whole inverse
-    grows with the square of ``n``, this with ``n``.
-    """
-    width, n = len(factor) - 1, factor.shape[1]
-    band, below = np.zeros((width + 1, n)), np.zeros((width, width))
-    own = np.array([np.append(factor[width - k, k:], np.zeros(k)) for k in range(width + 1)])
-    right = own[1:] / own[0]
-    for i in range(n - 1, -1, -1):
-        across = -below @ right[:, i]
-        band[0, i], band[1:, i] = 1.0 / own[0, i] ** 2 - right[:, i] @ across, across
-        below[1:, 1:] = below[:-1, :-1].copy()
-        below[0, :], below[:, 0] = band[:width, i], band[:width, i]
-    upper = dia_array((np.array([np.roll(one, k) for k, one in enumerate(band)]), np.arange(width + 1)), (n, n))
-    return csr_array(upper + dia_array((band[1:], -np.arange(1, width + 1)), (n, n)))
-
-
-def _undetermined(method: str) -> DivergenceError:
-    return DivergenceError(f"{method}: the readings do not determine the deflection", code="not-observable")
-
-
-def upper_band(matrix: csr_array) -> FloatArray:
-    """Symmetric matrix (n, n) as the rows of its upper band, the diagonal last."""
-    entries = coo_array(matrix)
-    above = entries.col - entries.row
-    width = int(np.max(above, initial=0))
-    out, keep = np.zeros((width + 1, matrix.shape[0])), above >= 0
-    out[width - above[keep], entries.col[keep]] = entries.data[keep]
-    return out
+    def _factor(self, size_radps2: float) -> ArrowFactor:
+        """Cholesky factor with the process's prior."""
+        readings, prior = self.matrix.band, self.spline.process_precision(size_radps2).band
+        band = np.zeros((max(len(prior), len(readings)), readings.shape[1]))
+        band[: len(readings)] = readings
+        band[: len(prior)] += prior
+        return replace(self.matrix, band=band).factor()
 
 
 def block_diagonal(blocks: FloatArray) -> csr_array:

@@ -138,11 +138,6 @@ def shares_of_spans(time_s: FloatArray, width_s: float, from_s: float) -> csr_ar
     return csr_array((1.0 / count[which], place), (len(count), len(time_s)))
 
 
-def means_over_spans(time_s: FloatArray, width_s: float, from_s: float) -> FloatArray:
-    """Weights of `shares_of_spans` as a full matrix (bins, n)."""
-    return np.asarray(shares_of_spans(time_s, width_s, from_s).toarray())
-
-
 class Method(Protocol):
     """Reads the deflection at all samples of loads, linear about a deflection; the inputs' responses on demand."""
 
@@ -239,8 +234,8 @@ def fuse(
     span = span_of(readings)
     alone = [_uncorrelated(moved_evidence(e, inputs)) for e in readings]
     problem = equations_of(alone, {}, span, knot_s)
-    found, size_radps2 = problem.mean(problem.process_size(), method), FREE_RADPS2
-    about = problem.history(found)
+    answer, size_radps2 = problem.solved(problem.process_size(), method), FREE_RADPS2
+    about = answer.deflection
     for step in range(MOST_STEPS):
         readings = [e for e in read(inputs, about) if e.method in methods]
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
@@ -248,17 +243,17 @@ def fuse(
                 f"{method}: the steps lead to deflections at which no method has an answer; see each method's own",
                 code="not-converged",
             )
-        problem, before = equations_of(readings, inputs, span, knot_s), found
+        problem, before = equations_of(readings, inputs, span, knot_s), answer.mean
         if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
-            size_radps2 = problem.without_inputs().process_size()
+            size_radps2 = problem.process_size()
         answer = problem.solved(size_radps2, method)
-        found, sd, size = answer.mean, answer.sd, 2 * problem.spline.count
-        new = {name: found[size:][place] for name, place in problem.place.items()}
-        moved = float((np.abs(found[:size] - before[:size]) / sd[:size]).max())
+        sd, size = answer.sd, 2 * problem.spline.count
+        new = {name: answer.of_inputs[place] for name, place in problem.place.items()}
+        moved = float((np.abs(answer.mean[:size] - before[:size]) / sd[:size]).max())
         for name in {e.time_bias for e in readings} & new.keys():
             bias = np.abs(new[name] - inputs.get(name, 0.0)) / sd[size:][problem.place[name]]
             moved = max(moved, float(bias.max()))
-        input_posterior = InputPosterior(found[size:], answer.inputs, problem.place)
+        input_posterior = InputPosterior(answer.of_inputs, answer.inputs, problem.place)
         if moved < SETTLED_SD and step > 0:
             if free_process:
                 _check_inputs(new, input_posterior, method)
@@ -267,12 +262,13 @@ def fuse(
             times = times[_apart_from_readings(times, readings) <= near_s]
             if free_process:
                 answer, size_radps2 = problem.smoothed(input_posterior, method)
-            return _posterior(answer, size_radps2, problem, input_posterior, readings, method, times)
+            return _posterior(answer, size_radps2, input_posterior, readings, method, times)
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate, about the smooth deflection: at the
         # ends of a long pulse the free one is off by ten degrees, where the methods are not linear, anew at each step
-        part, about = 1.0 if step < _WHOLE_STEPS else 0.5, problem.history(found)
+        part, smooth = 1.0 if step < _WHOLE_STEPS else 0.5, answer
         if free_process and step >= _WHOLE_STEPS:
-            about = problem.history(problem.smoothed(input_posterior, method)[0].mean)
+            smooth, _ = problem.smoothed(input_posterior, method)
+        about = smooth.deflection
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
     raise DivergenceError(
         f"{method}: the deflection did not converge: after {MOST_STEPS} steps it still moves by {moved:.2g} sd, where "
@@ -395,7 +391,7 @@ def _initial_time_bias(readings: list[Evidence], method: str, knot_s: float) -> 
         return {}
     span = span_of(own)
     problem = equations_of([_uncorrelated(e) for e in own], {}, span, knot_s)
-    deflection = problem.history(problem.mean(problem.process_size(), method))
+    deflection = problem.solved(problem.process_size(), method).deflection
     starts = {one.time_bias: _lowest_bias_sd(one, deflection, span) for one in off}
     return {name: np.array([bias_sd]) for name, bias_sd in starts.items() if bias_sd is not None}
 
@@ -497,25 +493,23 @@ def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatA
 def _posterior(
     answer: Solution,
     size_radps2: float,
-    problem: NormalEquations,
     input_posterior: InputPosterior,
     readings: list[Evidence],
     method: str,
     t: FloatArray,
 ) -> Fused:
-    spline, found = problem.spline, answer.mean
-    size = 2 * spline.count
-    value = spline.rows(t)
-    theta_yz, cov = problem.history(found)(t), answer.lateral_cov(value)
+    size, place = 2 * answer.spline.count, input_posterior.place
+    value = answer.spline.rows(t)
+    theta_yz, cov = answer.deflection(t), answer.lateral_cov(value)
     remark = f"from {', '.join(e.method for e in readings)} with their shared errors; joint as a second-order process"
     history = history_from_lateral(t, theta_yz, cov, method, remark)
     best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
-    pick = np.zeros((2 + len(problem.place), len(found)))
+    pick = np.zeros((2 + len(place), len(answer.mean)))
     pick[0, 0:size:2] = pick[1, 1:size:2] = value[[best]].toarray()[0]
-    for k, place in enumerate(problem.place.values()):
-        pick[2 + k, size + place.start] = 1.0
+    for k, at in enumerate(place.values()):
+        pick[2 + k, size + at.start] = 1.0
     joint = answer.covariance_of(pick)
     sd = np.sqrt(np.diag(joint))
-    names = ("deflection y", "deflection z", *problem.place)
+    names = ("deflection y", "deflection z", *place)
     correlation = joint / np.outer(sd, sd)
-    return Fused(history, input_posterior, correlation, names, float(t[best]), problem.history(found), size_radps2)
+    return Fused(history, input_posterior, correlation, names, float(t[best]), answer.deflection, size_radps2)

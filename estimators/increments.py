@@ -40,7 +40,7 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from estimators.balance import Swing, axial_residual
-from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Spline, inverse
+from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Spline
 from estimators.evidence import Deflection, Evidence, corrected_loads, input_responses, swing_responses
 from estimators.fusion import Fused, LoadsReader, knots_of, places, shares_of_spans, span_of, whitened
 from estimators.loads import FlightLoads
@@ -196,13 +196,14 @@ def estimate_increments(reader: LoadsReader, fused: Fused) -> Increments:
         increments = np.array([root @ inputs[name] for name, root in zip(COEFFICIENTS, roots, strict=True)])
         flown = replace(vehicle, aero=processes.flown(vehicle.aero, increments))
         normal = _equations(reader.with_vehicle(flown), deflection, inputs, _Slopes(processes, roots, increments))
-        mean, precision, found = normal.of_inputs(FREE_RADPS2, "aerodynamic increments")
+        answer = normal.solved(FREE_RADPS2, "aerodynamic increments")
+        mean, found = answer.of_inputs, answer.deflection
         step = mean.copy()
         for name, place in normal.place.items():
             step[place] -= inputs.get(name, 0.0)
-        moved = float(np.sqrt(step @ precision @ step))
+        moved = float(np.linalg.norm(answer.factor.corner.T @ step))
         if moved < _SETTLED_SD:
-            return Increments(processes, InputPosterior(mean, inverse(precision), normal.place))
+            return Increments(processes, InputPosterior(mean, answer.inputs, normal.place))
         if moved > 0.5 * before:  # whole steps lead to and fro between two points
             mean, found = mean - 0.5 * step, _halfway(deflection, found)
         deflection, before = found, moved

@@ -71,7 +71,6 @@ from recon.vector_attitude import (
     reconstruct_attitude,
     track,
 )
-from recon.vector_attitude import Settings as AttitudeSettings
 from recon.vector_attitude import compare as compare_attitudes
 
 Columns = dict[str, FloatArray]
@@ -672,8 +671,8 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
         t, points = track(telemetry)
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
         at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
-        chosen = AttitudeSettings(rate_hz=_RATE_HZ, confidence=settings.check_confidence)
-        history = reconstruct_attitude(telemetry, (at, interpolate_rows(at, t, points)), chosen)
+        place = at, interpolate_rows(at, t, points)
+        history = reconstruct_attitude(telemetry, place, _RATE_HZ, settings.check_confidence)
         comparison = compare_attitudes(history, bet.smoothed, settings.check_confidence)
         found += history.findings
     except GateError as fault:

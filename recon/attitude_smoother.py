@@ -16,7 +16,7 @@ integral of white angular acceleration of density ``g``, for which
 
 (to second order in a step's rotation), independent of each other. With the observations and the priors of the sensor
 errors this is one least-squares problem, solved by Gauss and Newton: an iterated Kalman smoother. The normal matrix is
-a band (knots) with a border (errors); LAPACK factors the band, the errors follow from the border's Schur complement.
+a band (knots) with a border (errors), `flightmodel.arrow`.
 
 The density is estimated from the flight, for each body axis and each stretch of `_STRETCH_S`, by MacKay's fixed point
 for the maximum of the marginal likelihood, ``g^2 = sum r^2 / gamma``: ``r`` are the estimated steps of the rate over
@@ -34,8 +34,8 @@ References
 F. Markley, "Attitude determination using vector observations and the singular value decomposition", J. Astronautical
 Sciences 36 (1988) 245. M. Shuster, S. Oh, "Three-axis attitude determination from vector observations", J. Guidance and
 Control 4 (1981) 70 (covariance of QUEST). B. Bell, SIAM J. Optim. 4 (1994) 626 (smoother as Gauss-Newton). D. MacKay,
-"Bayesian interpolation", Neural Computation 4 (1992) 415, section 4. K. Takahashi, J. Fagan, M. Chin, PICA 1973 (blocks
-of the inverse from the factor). L. Tierney, J. Kadane, J. Amer. Statist. Assoc. 81 (1986) 82 (Laplace's approximation).
+"Bayesian interpolation", Neural Computation 4 (1992) 415, section 4. L. Tierney, J. Kadane, J. Amer. Statist. Assoc. 81
+(1986) 82 (Laplace's approximation).
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flightmodel import earth, rotations
+from flightmodel.arrow import Arrow
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t, sun_direction_ecef
 from flightmodel.instruments import SunHeads, TriadSpec, direction_from_sun_angles, sun_angles_from_direction
@@ -122,11 +123,9 @@ def _head_name(index: int) -> str:
     return f"sun head {index + 1}"
 
 
-def error_terms(
-    magnetometer: TriadSpec, sun: SunHeads, unstated: UnstatedErrors, start_s: float, end_s: float
-) -> ErrorTerms:
+def error_terms(magnetometer: TriadSpec, sun: SunHeads, start_s: float, end_s: float) -> ErrorTerms:
     """Errors of two data sheets and of what they leave out, over a flight from ``start_s`` to ``end_s``."""
-    rows: list[tuple[str, str, str, float]] = []
+    unstated, rows = UnstatedErrors(), list[tuple[str, str, str, float]]()
 
     def add(instrument: str, kind: str, parts: tuple[str, ...], unit: str, sd: float) -> None:
         least = 1e-4 * _LEAST if unit == "T" else _LEAST
@@ -214,10 +213,9 @@ class VectorObservations:
         sensor = self.measured if self.is_field else direction_from_sun_angles(self.measured)
         return unit(sensor @ self.dcm_body_sensor.T)
 
-    def take(self, rows: BoolArray, knot: IntArray | None = None) -> VectorObservations:
-        """Some of the rows; ``knot`` holds their new knot numbers, where these change."""
+    def take(self, rows: BoolArray, number: IntArray) -> VectorObservations:
+        """Some of the rows, with new ``number`` of their knots."""
         names = ("lag_s", "measured", "noise_sd", "reference_eci", "up_eci", "drift")
-        number = self.knot[rows] if knot is None else knot
         return replace(self, knot=number, **{name: getattr(self, name)[rows] for name in names})
 
 
@@ -269,49 +267,34 @@ def observe_magnetometer(
     nodes, sd_of = terms.drift_nodes_s, terms.prior_sd
     # one axis of each kind stands for all; bias and field error rotate a direction by their part of the field
     angle = np.hypot(sd_of[0], sd_of[_FIELD_ERROR]) / max(float(np.median(np.linalg.norm(field, axis=1))), _LEAST)
+    reference, up = (rotations.rotate(turn, x) for x in (magnetic_field_ecef_t(place, t0_utc), unit(place)))
+    drift = np.column_stack([np.interp(at, nodes, share) for share in np.eye(len(nodes))])
+    constant = float(np.linalg.norm([angle, sd_of[3], sd_of[6], sd_of[9]]))
     return VectorObservations(
-        _MAGNETOMETER,
-        spec.dcm_body_sensor,
-        terms.of(_MAGNETOMETER),
-        0.0,
-        knot,
-        at - knots_s[knot],
-        field,
-        sd / np.sqrt(count),
-        rotations.rotate(turn, magnetic_field_ecef_t(place, t0_utc)),
-        rotations.rotate(turn, unit(place)),
-        np.column_stack([np.interp(at, nodes, share) for share in np.eye(len(nodes))]),
-        float(np.linalg.norm([angle, sd_of[3], sd_of[6], sd_of[9]])),
-    )
+        _MAGNETOMETER, spec.dcm_body_sensor, terms.of(_MAGNETOMETER), 0.0, knot, at - knots_s[knot], field,
+        sd / np.sqrt(count), reference, up, drift, constant,
+    )  # fmt: skip
 
 
 def observe_sun(
     record: SunRecord, t0_utc: str, knots_s: FloatArray, step_s: float, position: Position, terms: ErrorTerms
 ) -> list[VectorObservations]:
     """Block means of every Sun head that ever has the Sun in its field."""
-    out, spec = [], record.spec
+    out, spec, edge = [], record.spec, float(np.cos(0.5 * record.spec.field_rad))
+    shared = terms.prior_sd[terms.of(_HEADS)[:2]]
+    constant = float(np.linalg.norm([spec.bias_sd_rad, spec.mount_sd_rad, *shared]))
     for head, dcm in enumerate(spec.dcm_body_head):
         observed = direction_from_sun_angles(record.az_el_head_rad[:, head])
         knot, count, at, mean = _block_means(record.time_s, observed, knots_s, step_s)
         if len(knot) == 0:
             continue
-        turn = rotations.conjugate(earth.q_ecef_eci(at))
-        out.append(
-            VectorObservations(
-                _head_name(head),
-                dcm,
-                terms.of(_head_name(head), _HEADS),
-                float(np.cos(0.5 * spec.field_rad)),
-                knot,
-                at - knots_s[knot],
-                sun_angles_from_direction(mean),
-                max(spec.noise_sd_rad, _LEAST) / np.sqrt(count),
-                rotations.rotate(turn, sun_direction_ecef(t0_utc, at)),
-                rotations.rotate(turn, unit(position(at))),
-                np.empty((len(knot), 0)),
-                float(np.linalg.norm([spec.bias_sd_rad, spec.mount_sd_rad, *terms.prior_sd[terms.of(_HEADS)[:2]]])),
-            )
-        )
+        name, turn = _head_name(head), rotations.conjugate(earth.q_ecef_eci(at))
+        reference, up = (rotations.rotate(turn, x) for x in (sun_direction_ecef(t0_utc, at), unit(position(at))))
+        noise_sd = max(spec.noise_sd_rad, _LEAST) / np.sqrt(count)
+        out.append(VectorObservations(
+            name, dcm, terms.of(name, _HEADS), edge, knot, at - knots_s[knot], sun_angles_from_direction(mean),
+            noise_sd, reference, up, np.empty((len(knot), 0)), constant,
+        ))  # fmt: skip
     return out
 
 
@@ -467,34 +450,6 @@ class Fit:
     converged: bool = False
 
 
-@dataclass(frozen=True)
-class _Normal:
-    """Normal equations: blocks of knots (n, 6, 6) and of links (n - 1, 6, 6), border (n, 6, m), errors (m, m)."""
-
-    diagonal: FloatArray
-    below: FloatArray
-    border: FloatArray
-    errors: FloatArray
-    knot_side: FloatArray
-    error_side: FloatArray
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """Step of all unknowns, and covariances.
-
-    ``own`` (n, 6, 6) is the knots' covariance with the sensor errors known, ``next_by_own`` (n - 1, 6, 6) that of a
-    later knot with the one before, ``carried`` (n, 6, m) how much of an error a knot takes on, with opposite sign.
-    """
-
-    knots: FloatArray
-    errors: FloatArray
-    own: FloatArray
-    next_by_own: FloatArray
-    carried: FloatArray
-    error_covariance: FloatArray
-
-
 def smooth(
     knots: Knots, observations: list[VectorObservations], terms: ErrorTerms, q_eci_body: FloatArray
 ) -> tuple[Fit, list[VectorObservations]]:
@@ -519,36 +474,37 @@ def _iterate(fit: Fit, knots: Knots, observations: list[VectorObservations], ter
     estimate_density = True
     for fit.steps in range(1, 31):
         linear = [linearise(observed, fit.q_eci_body, fit.rate_radps, fit.errors) for observed in observations]
-        normal = _normal(fit, knots, observations, linear, terms)
-        normal.error_side[:] -= slope
-        solved = _solve(normal)
+        arrow, right = _normal(fit, knots, observations, linear, terms)
+        right[-terms.size :] -= slope
+        factor = arrow.factor()
+        own, next_by_own = factor.inverse_blocks(_BLOCK)
+        gain, fit.error_covariance = factor.gain.reshape(-1, _BLOCK, terms.size), factor.border_covariance
         for observed, line in zip(observations, linear, strict=True):
             if estimate_density and observed.is_field:
-                slope[observed.terms] = _volume_slope(observed, line, fit, solved.own)
-        fit.q_eci_body = rotations.boxplus(fit.q_eci_body, solved.knots[:, _ROTATION])
-        fit.rate_radps = fit.rate_radps + solved.knots[:, _RATE]
-        fit.errors = fit.errors + solved.errors
-        moved = float(np.abs(solved.knots[:, _ROTATION]).max())
+                slope[observed.terms] = _volume_slope(observed, line, fit, own)
+        of_knots, of_errors = np.split(factor.solve(right), [-terms.size])
+        step = of_knots.reshape(-1, _BLOCK)
+        fit.q_eci_body = rotations.boxplus(fit.q_eci_body, step[:, _ROTATION])
+        fit.rate_radps = fit.rate_radps + step[:, _RATE]
+        fit.errors = fit.errors + of_errors
+        moved = float(np.abs(step[:, _ROTATION]).max())
         fit.converged = not estimate_density and moved < 1e-6  # rad: rounding
         if fit.converged:
             break
         if estimate_density:
-            _update_density(fit, knots, solved)
+            _update_density(fit, knots, own, next_by_own, gain)
             estimate_density = fit.steps < 12 and moved > 5e-4  # rad: 0.03 deg
-    spread = solved.carried @ solved.error_covariance
-    fit.covariance = solved.own + spread @ np.swapaxes(solved.carried, 1, 2)
-    fit.error_covariance = solved.error_covariance
+    cross = gain @ fit.error_covariance
+    fit.covariance = own + cross @ np.swapaxes(gain, 1, 2)
     fit.misfit = {
-        observed.name: _misfit(
-            observed, line, fit.covariance[observed.knot], -spread[observed.knot], solved.error_covariance
-        )
-        for observed, line in zip(observations, linear, strict=True)
+        observed.name: _misfit(observed, line, fit, cross) for observed, line in zip(observations, linear, strict=True)
     }
 
 
 def _normal(
     fit: Fit, knots: Knots, observations: list[VectorObservations], linear: list[Linear], terms: ErrorTerms
-) -> _Normal:
+) -> tuple[Arrow, FloatArray]:
+    """Normal equations of a step, the knots' unknowns first, then the errors', and their right-hand side."""
     n, m = len(knots.time_s), terms.size
     diagonal, border, knot_side = np.zeros((n, _BLOCK, _BLOCK)), np.zeros((n, _BLOCK, m)), np.zeros((n, _BLOCK))
     diagonal[:, range(3, 6), range(3, 6)] = _RATE_PRIOR_SD**-2.0
@@ -562,7 +518,7 @@ def _normal(
         knot_side[observed.knot] += (weighted @ line.residual[:, :, None])[:, :, 0]
         border[observed.knot[:, None], :, observed.terms] += np.swapaxes(weighted @ line.by_errors, 1, 2)
         late = line.by_errors * weight
-        errors[np.ix_(observed.terms, observed.terms)] += _summed(late, line.by_errors)
+        errors[np.ix_(observed.terms, observed.terms)] += np.tensordot(late, line.by_errors, ((0, 1), (0, 1)))
         error_side[observed.terms] += np.einsum("rij,ri->j", late, line.residual)
 
     residual, early, late = _links(fit, knots)
@@ -573,7 +529,8 @@ def _normal(
     diagonal[1:] += late_weighted @ late
     knot_side[:-1] -= (early_weighted @ residual[:, :, None])[:, :, 0]
     knot_side[1:] -= (late_weighted @ residual[:, :, None])[:, :, 0]
-    return _Normal(diagonal, late_weighted @ early, border, errors, knot_side, error_side)
+    arrow = Arrow.of_blocks(diagonal, late_weighted @ early, border.reshape(-1, m), errors)
+    return arrow, np.concatenate([knot_side.ravel(), error_side])
 
 
 def _links(fit: Fit, knots: Knots) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -591,50 +548,6 @@ def _links(fit: Fit, knots: Knots) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.hstack([off, w[1:] - w[:-1]]), early, late
 
 
-def _solve(normal: _Normal) -> _Solved:
-    from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
-
-    n, m = len(normal.diagonal), len(normal.errors)
-    band = np.zeros((2 * _BLOCK, _BLOCK * n))
-    for i in range(_BLOCK):
-        for j in range(_BLOCK):
-            if i >= j:
-                band[i - j, j::_BLOCK] = normal.diagonal[:, i, j]
-            band[_BLOCK + i - j, j:-_BLOCK:_BLOCK] = normal.below[:, i, j]
-    factor = cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
-    sides = np.concatenate([normal.border, normal.knot_side[:, :, None]], axis=2).reshape(-1, m + 1)
-    answer = cho_solve_banded((factor, True), sides, check_finite=False).reshape(n, _BLOCK, m + 1)
-    carried, alone = answer[:, :, :m], answer[:, :, m]
-    schur = cho_factor(normal.errors - _summed(normal.border, carried))
-    errors = cho_solve(schur, normal.error_side - np.einsum("nij,ni->j", normal.border, alone))
-    own, next_by_own = _blocks_of_inverse(factor, n)
-    return _Solved(alone - carried @ errors, errors, own, next_by_own, carried, cho_solve(schur, np.eye(m)))
-
-
-def _summed(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Sum over n of ``left[n].T @ right[n]``: small products, which BLAS does not share out among its threads.
-
-    One product of all rows would be; beside other work on the machine its threads then wait for each other for seconds.
-    """
-    return np.asarray((np.swapaxes(left, 1, 2) @ right).sum(axis=0))
-
-
-def _blocks_of_inverse(factor: FloatArray, n: int) -> tuple[FloatArray, FloatArray]:
-    """Blocks of the inverse on the diagonal (n, 6, 6) and below it (n - 1, 6, 6), from the last knot to the first."""
-    corner, below = np.zeros((n, _BLOCK, _BLOCK)), np.zeros((n - 1, _BLOCK, _BLOCK))
-    for i in range(_BLOCK):
-        for j in range(_BLOCK):
-            if i >= j:
-                corner[:, i, j] = factor[i - j, j::_BLOCK]
-            below[:, i, j] = factor[_BLOCK + i - j, j:-_BLOCK:_BLOCK]
-    inverse = np.linalg.inv(corner)
-    own = np.swapaxes(inverse, 1, 2) @ inverse
-    gain = below @ inverse[:-1]
-    for k in range(n - 2, -1, -1):
-        own[k] += gain[k].T @ own[k + 1] @ gain[k]
-    return own, -own[1:] @ gain
-
-
 def _volume_slope(observed: VectorObservations, line: Linear, fit: Fit, own: FloatArray) -> FloatArray:
     """Slope of half the band's log-determinant with a sensor's errors, (p,); ``own`` (n, 6, 6) inverts the band.
 
@@ -649,16 +562,19 @@ def _volume_slope(observed: VectorObservations, line: Linear, fit: Fit, own: Flo
     return slope
 
 
-def _update_density(fit: Fit, knots: Knots, solved: _Solved) -> None:
+def _update_density(fit: Fit, knots: Knots, own: FloatArray, next_by_own: FloatArray, gain: FloatArray) -> None:
     """Move the densities towards where they agree with the estimated rates.
+
+    Given the knots' covariance (n, 6, 6) with the errors known, that of each with the one before (n - 1, 6, 6), and how
+    the knots change with the errors (n, 6, m).
 
     Downwards twice as far as the fixed point's step, which is slow there where the data contain little information.
     """
     linked = knots.linked[:, None]
-    own = np.diagonal(solved.own[:, _RATE, _RATE], axis1=1, axis2=2)
-    cross = np.diagonal(solved.next_by_own[:, _RATE, _RATE], axis1=1, axis2=2)
-    carried = np.diff(solved.carried[:, _RATE], axis=0)
-    undetermined = own[1:] + own[:-1] - 2.0 * cross + np.sum((carried @ solved.error_covariance) * carried, axis=2)
+    rate_var, cross = (np.diagonal(x[:, _RATE, _RATE], axis1=1, axis2=2) for x in (own, next_by_own))
+    by_errors = np.diff(gain[:, _RATE], axis=0)
+    undetermined = rate_var[1:] + rate_var[:-1] - 2.0 * cross
+    undetermined += np.sum((by_errors @ fit.error_covariance) * by_errors, axis=2)
     var = fit.density**2 * knots.step_s
     determined = np.where(linked, 1.0 - undetermined / var, 0.0)
     squares = np.where(linked, np.diff(fit.rate_radps, axis=0) ** 2 / var, 0.0)
@@ -672,14 +588,13 @@ def _update_density(fit: Fit, knots: Knots, solved: _Solved) -> None:
         fit.density[:, axis] = np.clip(moved, 2e-4, 20.0)  # the least is 0.011 deg/s^2 per root hertz
 
 
-def _misfit(
-    observed: VectorObservations, line: Linear, knot_cov: FloatArray, cross: FloatArray, error_cov: FloatArray
-) -> tuple[float, float]:
+def _misfit(observed: VectorObservations, line: Linear, fit: Fit, cross: FloatArray) -> tuple[float, float]:
     """Sum of squared residuals in units of their noise, and what it should be after the fit."""
     late = np.swapaxes(line.by_errors, 1, 2)
-    mixed = line.by_knot @ cross[:, :, observed.terms] @ late
-    fitted = line.by_knot @ knot_cov @ np.swapaxes(line.by_knot, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
-    fitted += line.by_errors @ error_cov[np.ix_(observed.terms, observed.terms)] @ late
+    mixed = line.by_knot @ cross[observed.knot][:, :, observed.terms] @ late
+    fitted = line.by_knot @ fit.covariance[observed.knot] @ np.swapaxes(line.by_knot, 1, 2)
+    fitted += mixed + np.swapaxes(mixed, 1, 2)
+    fitted += line.by_errors @ fit.error_covariance[np.ix_(observed.terms, observed.terms)] @ late
     taken = np.trace(fitted, axis1=1, axis2=2) / observed.noise_sd**2
     squares = np.sum(line.residual**2, axis=1) / observed.noise_sd**2
     return float(squares.sum()), float(np.sum(line.residual.shape[1] - taken))
@@ -690,4 +605,4 @@ def _edited(observed: VectorObservations, fit: Fit) -> VectorObservations:
     line = linearise(observed, fit.q_eci_body, fit.rate_radps, fit.errors)
     off = np.abs(line.residual).max(axis=1) / observed.noise_sd
     far = np.asarray(off > _EDIT_SD * max(1.0, NORMAL_MAD * float(np.median(off))))
-    return observed.take(~far) if 0.0 < far.mean() <= _MOST_EDITED else observed
+    return observed.take(~far, observed.knot[~far]) if 0.0 < far.mean() <= _MOST_EDITED else observed

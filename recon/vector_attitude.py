@@ -18,7 +18,7 @@ without these sensors: one whose filter used them too, or was started from them,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,6 @@ from recon.attitude_smoother import (
     Fit,
     Knots,
     Position,
-    UnstatedErrors,
     VectorObservations,
     error_terms,
     observe_magnetometer,
@@ -50,29 +49,7 @@ _START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude 
 _TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
 LEAST_INSIDE = 0.90  # of 95 % regions, less what blocks that are not independent scatter
 _MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
-_TABLE = ("name", "unit", "prior_sd", "estimate", "sd")
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What an analyst may choose.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Of blocks, knots and the history.
-    longest_gap_s : float
-        Without field or Sun, that is bridged; shorter where the vehicle turns by a quarter in less.
-    confidence : float
-        Two-sided, of each consistency check.
-    unstated : Unstated
-        Errors that no data sheet states.
-    """
-
-    rate_hz: float = 10.0
-    longest_gap_s: float = 5.0
-    confidence: float = 0.999
-    unstated: UnstatedErrors = field(default_factory=UnstatedErrors)
+_LONGEST_GAP_S = 5.0  # without field or Sun, that is bridged; shorter where the vehicle turns by a quarter in less
 
 
 @dataclass(frozen=True)
@@ -112,7 +89,8 @@ class AttitudeHistory:
 def reconstruct_attitude(
     telemetry: Telemetry,
     position: Position | tuple[FloatArray, FloatArray] | None = None,
-    settings: Settings | None = None,
+    rate_hz: float = 10.0,
+    confidence: float = 0.999,
 ) -> AttitudeHistory:
     """Attitude of the body over the time that magnetometer, Sun sensors and position cover together.
 
@@ -123,40 +101,52 @@ def reconstruct_attitude(
         Where the vehicle was. It only places the vehicle in the Earth's field, which changes by 25 nT/km at most: a
         kilometre is 0.03 deg, so a raw track is accurate enough, and no filter's attitude is used. Medians
         over a second of the flight's radars and receivers where it is not given.
-    settings : Settings, optional
+    rate_hz : float
+        Of blocks, knots and the history.
+    confidence : float
+        Two-sided, of each consistency check.
 
     Raises
     ------
     GateError
         Where magnetometer or Sun sensors are missing, share no time, or never fix an attitude.
     """
-    settings = settings or Settings()
     magnetometer, sun = _required_vectors(telemetry)
     place, spans = _place(telemetry, position)
     spans += [(magnetometer.time_s[0], magnetometer.time_s[-1]), (sun.time_s[0], sun.time_s[-1])]
     start_s, end_s = max(a for a, _ in spans), min(b for _, b in spans)
-    step_s = 1.0 / settings.rate_hz
-    first, last = np.ceil(start_s * settings.rate_hz - 1e-6), np.floor(end_s * settings.rate_hz + 1e-6)
+    step_s = 1.0 / rate_hz
+    first, last = np.ceil(start_s * rate_hz - 1e-6), np.floor(end_s * rate_hz + 1e-6)
     if last - first < 2:
         raise GateError(
             f"flight '{telemetry.name}': magnetometer, Sun sensors and position share {start_s:.3f} to {end_s:.3f} s, "
             "too little for an attitude; check their time bases",
             code="time-not-covered",
         )
-    knots_s = np.arange(first, last + 1.0) / settings.rate_hz
-    terms = error_terms(magnetometer.spec, sun.spec, settings.unstated, float(knots_s[0]), float(knots_s[-1]))
-    observations = [
-        observe_magnetometer(magnetometer, telemetry.t0_utc, knots_s, step_s, place, terms),
-        *observe_sun(sun, telemetry.t0_utc, knots_s, step_s, place, terms),
-    ]
+    knots_s = np.arange(first, last + 1.0) / rate_hz
+    terms = error_terms(magnetometer.spec, sun.spec, float(knots_s[0]), float(knots_s[-1]))
+    about = telemetry.t0_utc, knots_s, step_s, place, terms
+    observations = [observe_magnetometer(magnetometer, *about), *observe_sun(sun, *about)]
     solved, q = _solve_each(telemetry.name, observations, len(knots_s))
-    keep, findings = _bridged(knots_s, solved, q, settings)
+    keep, findings = _bridged(knots_s, solved, q)
     kept_s = knots_s[keep]
-    observations = [_renumbered(observed, keep) for observed in observations]
+    number = np.cumsum(keep) - 1
+    observations = [one.take(rows := keep[one.knot], number[one.knot[rows]]) for one in observations]
     q_start = rotations.slerp(knots_s[solved], q, kept_s) if len(solved) > 1 else q
     knots = Knots(kept_s, step_s, np.asarray(np.diff(np.flatnonzero(keep)) == 1))
     fit, used = smooth(knots, [observed for observed in observations if len(observed.knot)], terms, q_start)
-    return _history(knots, fit, terms, used, [*findings, *_fit_findings(fit, observations, used, knots)], settings)
+    columns = terms.names, terms.units, terms.prior_sd, fit.errors, np.sqrt(np.diagonal(fit.error_covariance))
+    return AttitudeHistory(
+        time_s=kept_s,
+        q_ecef_body=rotations.continuous(rotations.multiply(earth.q_ecef_eci(kept_s), fit.q_eci_body)),
+        covariance=fit.covariance[:, :3, :3],
+        rate_body_radps=fit.rate_radps,
+        method="magnetometer and Sun sensors, smoothed; no gyro, no accelerometer",
+        findings=(*findings, *_fit_findings(fit, observations, used, kept_s)),
+        consistency_checks=tuple(_consistency_checks(fit, terms, confidence)),
+        sensor_errors=pd.DataFrame(dict(zip(("name", "unit", "prior_sd", "estimate", "sd"), columns, strict=True))),
+        observations=tuple(used),
+    )
 
 
 def _required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
@@ -228,12 +218,12 @@ def _solve_each(name: str, observations: list[VectorObservations], count: int) -
     return both[sharp], rotations.continuous(q[sharp])
 
 
-def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings) -> tuple[BoolArray, list[Issue]]:
+def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray) -> tuple[BoolArray, list[Issue]]:
     """Knots to solve at: between those with an attitude, less gaps too long to be bridged, which are findings."""
     step = np.diff(knots_s[solved])
     rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
     rate = float(np.median(rotated / step)) if len(step) else 0.0
-    longest = min(settings.longest_gap_s, 0.5 * np.pi / max(rate, 1e-9))
+    longest = min(_LONGEST_GAP_S, 0.5 * np.pi / max(rate, 1e-9))
     keep = np.zeros(len(knots_s), dtype=bool)
     keep[solved[0] : solved[-1] + 1] = True
     found = []
@@ -245,54 +235,19 @@ def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Set
     return keep, found
 
 
-def _renumbered(observed: VectorObservations, keep: BoolArray) -> VectorObservations:
-    rows = np.asarray(keep[observed.knot])
-    return observed.take(rows, (np.cumsum(keep) - 1)[observed.knot[rows]])
-
-
 def _fit_findings(
-    fit: Fit, before: list[VectorObservations], after: list[VectorObservations], knots: Knots
+    fit: Fit, before: list[VectorObservations], after: list[VectorObservations], time_s: FloatArray
 ) -> list[Issue]:
-    ends = float(knots.time_s[0]), float(knots.time_s[-1])
-    kept = {observed.name: len(observed.knot) for observed in after}
+    ends, kept = (float(time_s[0]), float(time_s[-1])), {observed.name: len(observed.knot) for observed in after}
+    edited = {observed.name: len(observed.knot) - kept.get(observed.name, len(observed.knot)) for observed in before}
     found = [
-        Issue(
-            f"{len(observed.knot) - kept[observed.name]} blocks edited from the attitude check",
-            "points-edited",
-            observed.name,
-            *ends,
-        )
-        for observed in before
-        if len(observed.knot) > kept.get(observed.name, len(observed.knot))
+        Issue(f"{count} blocks edited from the attitude check", "points-edited", name, *ends)
+        for name, count in edited.items()
+        if count
     ]
     if not fit.converged:
         found.append(Issue(f"not converged after {fit.steps} steps", "not-converged", "attitude check", *ends))
     return found
-
-
-def _history(
-    knots: Knots,
-    fit: Fit,
-    terms: ErrorTerms,
-    used: list[VectorObservations],
-    findings: list[Issue],
-    settings: Settings,
-) -> AttitudeHistory:
-    sd = np.sqrt(np.diagonal(fit.error_covariance))
-    table = pd.DataFrame(
-        dict(zip(_TABLE, (list(terms.names), list(terms.units), terms.prior_sd, fit.errors, sd), strict=True))
-    )
-    return AttitudeHistory(
-        time_s=knots.time_s,
-        q_ecef_body=rotations.continuous(rotations.multiply(earth.q_ecef_eci(knots.time_s), fit.q_eci_body)),
-        covariance=fit.covariance[:, :3, :3],
-        rate_body_radps=fit.rate_radps,
-        method="magnetometer and Sun sensors, smoothed; no gyro, no accelerometer",
-        findings=tuple(findings),
-        consistency_checks=tuple(_consistency_checks(fit, terms, settings.confidence)),
-        sensor_errors=table,
-        observations=tuple(used),
-    )
 
 
 def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Check]:

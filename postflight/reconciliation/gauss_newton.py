@@ -24,6 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
+from flightmodel.arrow import Arrow
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray
 from postflight.reconciliation.forward_model import (
     ATTITUDE,
@@ -45,12 +46,12 @@ from postflight.reconciliation.forward_model import (
     fly_spans,
     integrable,
 )
-from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
+from postflight.reconciliation.normal_equations import NormalEquations, add_part
 from synthetic_flight import simulate
 from synthetic_flight.dynamics import joint_modes
 
 INSTRUMENTS = 20
-BORDERS = 3  # of the normal equations: of the sounding's errors that are constant in density, north and east wind
+CONSTANT = 3  # rows of the normal equations: the sounding's errors that are constant in density, north and east wind
 # process noise of the joins per rad of flow angle that turbulence between knots GUST_KNOT_M apart makes, at the largest
 # dynamic pressure: rotation rad, rate rad/s, deflection rad, its rate rad/s, velocity m/s (of a span's lateral force);
 # and the noise that is left in vacuum
@@ -384,28 +385,29 @@ class Problem:
 
     def normal_equations(self, u: Parameters, linear: Linearization) -> NormalEquations:
         """Normal equations of a step from ``u``."""
-        place, shared, reach = self._arranged
-        knots, first_air = len(self.air.knots_m), self.first_instrument + INSTRUMENTS
-        matrix = ArrowMatrix.zeros(shared, len(place) + BORDERS - shared, reach)
+        place, n, reach = self._arranged
+        shared, knots, first_air = len(place) + CONSTANT - n, len(self.air.knots_m), self.first_instrument + INSTRUMENTS
+        matrix = Arrow(np.zeros((reach + 1, n)), np.zeros((n, shared)), np.zeros((shared, shared)))
         for column, response in (*linear.sensors, *linear.joins):
-            matrix.add(place[column], response.T @ response)
+            add_part(matrix.band, matrix.across, matrix.corner, place[column], response.T @ response)
         for part, precision, _ in self._priors(u):
             if not first_air <= part.start < self.first_temperature:
-                matrix.add(place[part], precision)
+                add_part(matrix.band, matrix.across, matrix.corner, place[part], precision)
         for kind, (diagonal, beside, constant) in enumerate(self.air.inverse_covariance):
-            at, border = place[first_air + kind * knots :][:knots], shared - BORDERS + kind
-            matrix.add_pairs(at, at, diagonal)
-            matrix.add_pairs(at[:-1], at[1:], beside)
-            matrix.across[at - shared, border] = constant
+            at, border = place[first_air + kind * knots :][:knots], shared - CONSTANT + kind
+            first, second = np.minimum(at[:-1], at[1:]), np.maximum(at[:-1], at[1:])
+            matrix.band[0, at] += diagonal
+            matrix.band[second - first, first] += beside
+            matrix.across[at, border] = constant
             matrix.corner[border, border] = 1.0
         return NormalEquations(matrix, self.right_hand_side(u, linear, linear.residuals), place)
 
     @cached_property
     def _arranged(self) -> tuple[Index, int, int]:
-        """Rows (count,) of the parameters in the matrix, how many are shared, and how far from the diagonal it reaches.
+        """Rows (count,) of the parameters in the matrix, how many are its band's, and how far that reaches.
 
-        First vehicle, instruments, temperature, and a border for each kind of air; then span by span the air that it is
-        the first to pass, from above, and its motion. Air that no span passes comes before all spans, or after.
+        First span by span the air that it is the first to pass, from above, and its motion; then vehicle, instruments,
+        temperature, and a row for each kind of air. Air that no span passes comes before all spans, or after.
         """
         measured, free = self.measured, self.first_instrument + INSTRUMENTS
         warm, spans = self.first_motion - self.first_temperature, np.arange(self.measured.spans)
@@ -417,13 +419,13 @@ class Problem:
         order = np.lexsort((deeper, by_span))
         local = np.empty_like(order)
         local[order] = np.arange(len(order))
-        shared, air = free + warm + BORDERS, 3 * len(self.air.knots_m)
-        place = np.concatenate([np.arange(free), shared + local[:air], free + np.arange(warm), shared + local[air:]])
+        air, shared = 3 * len(self.air.knots_m), len(order) + np.arange(free + warm)
+        place = np.concatenate([shared[:free], local[:air], shared[free:], local[air:]])
         reach = int(np.abs(np.diff(local[:air].reshape(3, -1), axis=1)).max())
         for span, near in enumerate(self._nearby_air):
             motions = local[air + self.motion * span :][: 2 * self.motion]  # its own and the next one's
             reach = max(reach, int(np.ptp(np.concatenate([local[near[near < air]], motions]))))
-        return place, shared, reach
+        return place, len(order), reach
 
     def right_hand_side(self, u: Parameters, linear: Linearization, residuals: Residuals) -> FloatArray:
         """Right-hand side of a step from ``u`` with its residuals, by derivatives at ``u`` or nearby."""

@@ -3,27 +3,17 @@
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
-from scipy.linalg import cholesky_banded, lstsq
-from scipy.sparse import csr_array
+from scipy.linalg import lstsq
 
 from estimators.deflection_spline import (
     KNOT_S,
+    SIZE_LOG_SD,
+    SIZE_RADPS2,
     NormalEquations,
     Rows,
     Spline,
     block_diagonal,
-    inverse,
-    inverse_in_band,
-    upper_band,
 )
-
-
-def unbanded(band):
-    """Symmetric matrix (n, n) of its upper band, the diagonal last."""
-    width, n = len(band) - 1, band.shape[1]
-    upper = sum(np.diag(band[width - k, k:], k) for k in range(width + 1))
-    assert upper.shape == (n, n)
-    return upper + np.triu(upper, 1).T
 
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])
@@ -57,17 +47,6 @@ def test_smooth_values_are_the_least_squares_fit_over_holes_too():
     np.testing.assert_allclose(spline.smooth(time_s, values), wanted, atol=1e-6)
 
 
-def test_the_inverse_in_the_band_is_that_of_the_whole_matrix():
-    rng, n, width = np.random.default_rng(3), 40, 5
-    root = np.triu(np.tril(rng.normal(size=(n, n)), width)) + 4.0 * np.eye(n)
-    matrix = root.T @ root
-    band = upper_band(csr_array(matrix))
-    np.testing.assert_array_equal(unbanded(band), np.triu(matrix) + np.triu(matrix, 1).T)
-    got, whole = inverse_in_band(cholesky_banded(band)).toarray(), np.linalg.inv(matrix)
-    inside = np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= width
-    np.testing.assert_allclose(got, np.where(inside, whole, 0.0), atol=1e-12)
-
-
 def test_blocks_stand_on_the_diagonal():
     blocks = np.random.default_rng(4).normal(size=(3, 2, 2))
     got = block_diagonal(blocks).toarray()
@@ -76,33 +55,40 @@ def test_blocks_stand_on_the_diagonal():
     assert np.count_nonzero(got) == 12
 
 
-def equations(columns):
-    """Of 60 readings at random with the responses to nine inputs, of which those of some columns are asked for."""
+def written_out(columns):
+    """Rows of 60 readings at random with the responses to nine inputs, of which those of some columns are asked for."""
     rng, spline = np.random.default_rng(6), Spline.over(0.0, 1.5)
     time_s, by_input, want = rng.uniform(0.0, 1.5, 60), rng.normal(size=(120, 9)), rng.normal(size=120)
     lateral = np.broadcast_to(30.0 * np.eye(2), (60, 2, 2))
-    rows = Rows(spline.responses(time_s, (lateral,)), by_input[:, columns], want)
-    return NormalEquations.of_rows(spline, {"all": slice(0, by_input[:, columns].shape[1])}, [rows])
+    return Rows(spline.responses(time_s, (lateral,)), by_input[:, columns], want)
 
 
-def test_inputs_integrated_over_leave_the_posterior_of_the_rest():
-    whole, kept, size = equations(slice(None)), slice(3, 5), 2.0
-    answer, others = whole.solved(size, ""), equations(np.r_[0:3, 5:9])
-    part = whole.without_inputs(kept)
-    mean, precision, _ = part.of_inputs(size, "")
-    first = 2 * whole.spline.count
-    np.testing.assert_allclose(mean, answer.mean[first:][kept], rtol=1e-9)
-    np.testing.assert_allclose(inverse(precision), answer.inputs[kept, kept], rtol=1e-9)
-    np.testing.assert_allclose(whole.without_inputs().mean(size, ""), answer.mean[:first], atol=1e-12)
-    # the kept ones taken as stated
-    stated = part.with_inputs(slice(0, 0)).mean(size, "")
-    np.testing.assert_allclose(stated, others.solved(size, "").mean[:first], atol=1e-12)
-    assert np.abs(stated - answer.mean[:first]).max() > 1e-4
+def equations(columns):
+    """Normal equations of these rows."""
+    rows = written_out(columns)
+    return NormalEquations.of_rows(Spline.over(0.0, 1.5), {"all": slice(0, rows.by_input.shape[1])}, [rows])
 
 
 def test_one_input_of_several_is_found_as_if_it_were_the_only_one():
-    mean, precision, found = equations(slice(None)).with_inputs(slice(4, 6)).of_inputs(2.0, "")
-    alone = equations(slice(4, 6)).of_inputs(2.0, "")
-    np.testing.assert_allclose(mean, alone[0], rtol=1e-12)
-    np.testing.assert_allclose(precision, alone[1], rtol=1e-12)
-    np.testing.assert_allclose(found(np.array([0.7])), alone[2](np.array([0.7])), rtol=1e-12)
+    got, alone = (
+        equations(slice(None)).with_inputs(np.array([4, 5])).solved(2.0, ""),
+        equations(slice(4, 6)).solved(2.0, ""),
+    )
+    np.testing.assert_allclose(got.of_inputs, alone.of_inputs, rtol=1e-12)
+    np.testing.assert_allclose(got.inputs, alone.inputs, rtol=1e-12)
+    np.testing.assert_allclose(got.deflection(np.array([0.7])), alone.deflection(np.array([0.7])), rtol=1e-12)
+
+
+def test_the_process_has_the_size_of_the_readings_whole_density():
+    """The readings' covariance with deflection and inputs integrated over, written out at a few sizes."""
+    normal, rows = equations(slice(0, 3)), written_out(slice(0, 3))
+
+    def surprise(size):
+        prior = np.linalg.inv(normal.spline.process_precision(size).dense)
+        cov = np.eye(len(rows.want)) + rows.by_input @ rows.by_input.T
+        cov += rows.by_deflection @ prior @ rows.by_deflection.toarray().T
+        a_priori = 0.5 * (np.log(size / SIZE_RADPS2) / SIZE_LOG_SD) ** 2
+        return a_priori + 0.5 * rows.want @ np.linalg.solve(cov, rows.want) + 0.5 * np.linalg.slogdet(cov)[1]
+
+    found = normal.process_size()
+    assert surprise(found) < min(surprise(0.8 * found), surprise(1.25 * found))

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.sparse import csr_array
 
 from estimators import increments
-from estimators.deflection_spline import DEFLECTION_SD_RAD, FREE_RADPS2, inverse
+from estimators.deflection_spline import DEFLECTION_SD_RAD, FREE_RADPS2
 from estimators.fusion import equations_of, fuse, loads_reader
 from estimators.increments import COEFFICIENTS, SHAPE_LENGTH, STATED, Processes, estimate_increments
 from flightmodel.atmosphere import standard_atmosphere
@@ -17,7 +17,6 @@ from synthetic_flight.simulate import fly
 
 from .conftest import VEHICLE
 from .test_closure import EPOCH, START_S, pulse_of_truth, start
-from .test_deflection_spline import unbanded
 from .test_fusion import METHODS, TIME_S, N, linear_evidence, motion
 
 MACH = np.linspace(1.5, 3.4, 40)
@@ -69,16 +68,16 @@ def test_inputs_with_the_deflection_integrated_over_are_those_of_the_whole_probl
     one = replace(linear_evidence(rng, "a", ("p", "q")), theta_yz_rad=motion() + 1e-3 * rng.normal(size=(N, 2)))
     normal = equations_of([one], {}, (TIME_S[0], TIME_S[-1]))
     size = 2 * normal.spline.count
-    matrix = np.block([[unbanded(normal.deflection), normal.across], [normal.across.T, normal.inputs]])
-    stiffness = normal.spline.stiffness.toarray()
-    matrix[:size, :size] += stiffness / FREE_RADPS2**2 + np.eye(size) / DEFLECTION_SD_RAD**2
+    matrix = normal.matrix.dense
+    curvature = np.kron(normal.spline.rows(normal.spline.knots_s, 2).toarray(), np.eye(2))
+    matrix[:size, :size] += curvature.T @ curvature / FREE_RADPS2**2 + np.eye(size) / DEFLECTION_SD_RAD**2
     covariance = np.linalg.inv(matrix)
-    mean = covariance @ np.concatenate([normal.right, normal.right_inputs])
-    own, precision, deflection = normal.of_inputs(FREE_RADPS2, "inputs")
-    np.testing.assert_allclose(own, mean[size:], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(inverse(precision), covariance[size:, size:], rtol=1e-6)
-    np.testing.assert_allclose(deflection(TIME_S), normal.history(mean)(TIME_S), atol=1e-9)
+    mean = covariance @ normal.right
     found = normal.solved(FREE_RADPS2, "whole")
+    np.testing.assert_allclose(found.of_inputs, mean[size:], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.inputs, covariance[size:, size:], rtol=1e-6)
+    whole = normal.spline.rows(TIME_S) @ mean[:size].reshape(-1, 2)
+    np.testing.assert_allclose(found.deflection(TIME_S), whole, atol=1e-9)
     np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=1e-5)
     value = normal.spline.rows(TIME_S[::7]).toarray()
     lateral = value @ covariance[:size:2, 1:size:2] @ value.T

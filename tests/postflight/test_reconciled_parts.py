@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from flightmodel.arrow import Arrow
 from flightmodel.atmosphere import default_sounding_sd, us76
 from flightmodel.telemetry import Sounding
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
@@ -34,7 +35,7 @@ from postflight.reconciliation.gauss_newton import (
     stiffness_step,
 )
 from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spectra
-from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
+from postflight.reconciliation.normal_equations import NormalEquations, add_part
 from postflight.reconciliation.posterior import joint_table, stiffness_bound
 from synthetic_flight.dynamics import angle_beyond_freeplay, joint_modes
 from tests.refusing import refuses
@@ -44,9 +45,7 @@ VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
 
 def full(matrix):
     """Matrix as one without a band."""
-    out = ArrowMatrix.zeros(len(matrix), 0, 0)
-    out.add(np.arange(len(matrix)), matrix)
-    return out
+    return Arrow(np.zeros((1, 0)), np.zeros((0, len(matrix))), matrix)
 
 
 def test_evidence_is_the_integral_of_the_posterior():
@@ -124,60 +123,51 @@ def test_a_step_whose_look_ahead_tumbles_is_tried_straight():
     assert found.cost == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize(("shared", "blocks", "size"), [(7, 12, 5), (0, 4, 3), (6, 0, 5), (3, 1, 4)])
-def test_normal_equations_of_an_arrow_are_solved_as_full_ones(shared, blocks, size):
-    rng = np.random.default_rng(5)
-    n = shared + blocks * size
-    response = rng.standard_normal((3 * n, n)) * np.exp(3.0 * rng.standard_normal(n))
-    matrix = response.T @ response
-    block = np.maximum(np.arange(n) - shared, -1) // size
-    apart = np.abs(block[:, None] - block) > 1
-    matrix[apart & (block[:, None] >= 0) & (block >= 0)] = 0.0
-    matrix += np.diag(0.5 * np.abs(matrix).sum(axis=1) * (block >= 0))  # positive definite without what was taken out
-    right = rng.standard_normal(n)
-    arrow = ArrowMatrix.zeros(shared, blocks * size, 2 * size - 1)
-    # all that is shared, then the rest block by block with the next
-    arrow.add(np.arange(shared), matrix[:shared, :shared])
-    left = matrix.copy()
-    left[:shared, :shared] = 0.0
-    for start in range(shared, n, size):
-        columns = np.concatenate([np.arange(shared), np.arange(start, min(start + 2 * size, n))])
-        part = left[np.ix_(columns, columns)]
-        arrow.add(columns, part)
-        left[np.ix_(columns, columns)] = 0.0
-    np.testing.assert_allclose(arrow.dense, matrix, rtol=1e-14)
-    normal = NormalEquations(arrow, right, np.arange(n))
+def scattered(place, matrix, m):
+    """Arrow of a matrix whose rows stand at ``place`` in it, the last ``m`` places in the border."""
+    n = len(place) - m
+    arrow = Arrow(np.zeros((n, n)), np.zeros((n, m)), np.zeros((m, m)))
+    add_part(arrow.band, arrow.across, arrow.corner, place, matrix)
+    return arrow
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_normal_equations_are_solved_as_full_ones_wherever_the_parameters_stand(damping):
+    rng, n = np.random.default_rng(5), 12
+    response = rng.standard_normal((40, n)) * np.exp(3.0 * rng.standard_normal(n))
+    place, matrix, right = rng.permutation(n), response.T @ response, rng.standard_normal(n)
+    normal = NormalEquations(scattered(place, matrix, 5), right, place)
+    np.testing.assert_allclose(normal.dense, matrix, rtol=1e-14)
     scale = 1.0 / np.sqrt(np.diag(matrix))
-    for damping in (0.0, 0.3):
-        damped = matrix + damping * np.diag(np.diag(matrix))
-        want = np.linalg.solve(damped * scale[:, None] * scale, right * scale) * scale
-        np.testing.assert_allclose(normal.solver(damping)(right) / scale, want / scale, rtol=1e-9, atol=1e-10)
+    damped = matrix + damping * np.diag(np.diag(matrix))
+    want = np.linalg.solve(damped * scale[:, None] * scale, right * scale) * scale
+    np.testing.assert_allclose(normal.solver(damping)(right) / scale, want / scale, rtol=1e-9, atol=1e-10)
     some = rng.permutation(n)[:4]
     want = np.linalg.inv(matrix * scale[:, None] * scale)[np.ix_(some, some)]
     np.testing.assert_allclose(normal.covariance_of(some) / np.outer(scale[some], scale[some]), want, atol=1e-9)
     assert normal.log_det == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-9)
-    np.testing.assert_allclose(arrow.without(shared // 2).dense, matrix[shared // 2 :, shared // 2 :], rtol=1e-14)
 
 
-def test_a_border_takes_an_outer_product_from_the_matrix():
-    rng = np.random.default_rng(6)
-    shared, n = 3, 12
+def test_a_row_more_takes_an_outer_product_from_the_matrix():
+    rng, n, m = np.random.default_rng(6), 12, 4
     response, u = rng.standard_normal((40, n)), 0.5 * rng.standard_normal((n, 2))
+    u[0] = 0.0  # what is held is no air
     want = response.T @ response + 2.0 * np.eye(n) - u @ u.T
-    place, borders = rng.permutation(np.r_[0:2, 4 : n + 2]), np.array([2, 3])
-    arrow = ArrowMatrix.zeros(shared + 1, n + 2 - shared - 1, n)
-    arrow.add(place, response.T @ response + 2.0 * np.eye(n))
-    bordered = np.zeros((n + 2, 2))
-    bordered[place] = u
-    bordered[borders] = np.eye(2)
-    arrow.corner[:, borders], arrow.across[:, borders] = bordered[:4], bordered[4:]
-    arrow.corner[borders] = arrow.corner[:, borders].T
-    normal, right = NormalEquations(arrow, rng.standard_normal(n), place), rng.standard_normal((n, 3))
+    # two parameters are first of the border, and after them stand the rows of no parameter
+    place = np.concatenate([[10, 11], rng.permutation(10)])
+    rows = np.concatenate([place, [12, 13]])
+    matrix = np.block([[response.T @ response + 2.0 * np.eye(n), u], [u.T, np.eye(2)]])
+    normal = NormalEquations(scattered(rows, matrix, m), rng.standard_normal(n), place)
+    right = rng.standard_normal((n, 3))
     np.testing.assert_allclose(normal.dense, want, rtol=1e-12, atol=1e-12)
     for damping in (0.0, 0.3):
         damped = want + damping * np.diag(np.diag(want))
         np.testing.assert_allclose(normal.solver(damping)(right), np.linalg.solve(damped, right), rtol=1e-9, atol=1e-12)
     assert normal.log_det == pytest.approx(np.linalg.slogdet(want)[1], abs=1e-9)
+    coupling, others = normal.without(1)
+    np.testing.assert_allclose(coupling[:, 0], want[1:, 0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(others.dense, want[1:, 1:], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(others.solve(right[1:]), np.linalg.solve(want[1:, 1:], right[1:]), rtol=1e-9, atol=1e-12)
 
 
 def stiff(factor):

@@ -21,8 +21,7 @@ def observed(mini_everything, mini_truth):
     """Observations, attitudes, rates and errors of every kind, none of them zero."""
     telemetry = mini_everything(3)
     knots_s = np.arange(110.0, 114.0, STEP_S)
-    unstated = smoother.UnstatedErrors()
-    terms = smoother.error_terms(MAGNETOMETER, HEADS, unstated, knots_s[0], knots_s[-1])
+    terms = smoother.error_terms(MAGNETOMETER, HEADS, knots_s[0], knots_s[-1])
     about = EPOCH, knots_s, STEP_S, lambda at: mini_truth.state(at)[0], terms
     out = [
         smoother.observe_magnetometer(telemetry.magnetometer, *about),
