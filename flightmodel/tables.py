@@ -30,16 +30,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
-from scipy import constants
 
 from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.config import KeyFault, Section, Time
-from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
 
 if TYPE_CHECKING:
@@ -59,65 +58,9 @@ class Unit(NamedTuple):
 
 
 _ALONG_AXES = {"acceleration", "rate", "magnetic field"}
-UNITS: dict[str, Unit] = {
-    "s": Unit("time", 1.0),
-    "ms": Unit("time", 1e-3),
-    "us": Unit("time", 1e-6),
-    "min": Unit("time", 60.0),
-    "m": Unit("length", 1.0),
-    "cm": Unit("length", 0.01),
-    "mm": Unit("length", 1e-3),
-    "km": Unit("length", 1000.0),
-    "yd": Unit("length", constants.yard),
-    "ft": Unit("length", constants.foot),
-    "kft": Unit("length", 1000.0 * constants.foot),
-    "kyd": Unit("length", 1000.0 * constants.yard),
-    "mi": Unit("length", constants.mile),
-    "nmi": Unit("length", constants.nautical_mile),
-    "rad": Unit("angle", 1.0),
-    "mrad": Unit("angle", 1e-3),
-    "deg": Unit("angle", _DEG),
-    "gon": Unit("angle", np.pi / 200.0),
-    "mil": Unit("angle", 2.0 * np.pi / 6400.0),
-    "deg1e7": Unit("angle", 1e-7 * _DEG),  # whole numbers, as many receivers write a latitude
-    "mps2": Unit("acceleration", 1.0),
-    "g": Unit("acceleration", STANDARD_GRAVITY_MPS2),
-    "mg": Unit("acceleration", 1e-3 * STANDARD_GRAVITY_MPS2),
-    "ftps2": Unit("acceleration", constants.foot),
-    "radps": Unit("rate", 1.0),
-    "mradps": Unit("rate", 1e-3),
-    "degps": Unit("rate", _DEG),
-    "degph": Unit("rate", _DEG / 3600.0),
-    "rpm": Unit("rate", 2.0 * np.pi / 60.0),
-    "t": Unit("magnetic field", 1.0),
-    "ut": Unit("magnetic field", 1e-6),
-    "nt": Unit("magnetic field", 1e-9),
-    "gauss": Unit("magnetic field", 1e-4),
-    "mps": Unit("speed", 1.0),
-    "cmps": Unit("speed", 0.01),
-    "mmps": Unit("speed", 1e-3),
-    "kmh": Unit("speed", constants.kmh),
-    "kt": Unit("speed", constants.knot),
-    "mph": Unit("speed", constants.mph),
-    "ftps": Unit("speed", constants.foot),
-    "kgpm3": Unit("density", 1.0),
-    "gpm3": Unit("density", 1e-3),
-    "slugpft3": Unit("density", constants.slug / constants.foot**3),
-    "lbpft3": Unit("density", constants.pound / constants.foot**3),
-    "k": Unit("temperature", 1.0),
-    "degc": Unit("temperature", 1.0, constants.zero_Celsius),
-    "degf": Unit("temperature", constants.degree_Fahrenheit, constants.convert_temperature(0.0, "F", "K")),
-    "degr": Unit("temperature", constants.degree_Fahrenheit),
-    "pa": Unit("pressure", 1.0),
-    "hpa": Unit("pressure", 100.0),
-    "kpa": Unit("pressure", 1000.0),
-    "psi": Unit("pressure", constants.psi),
-    "psf": Unit("pressure", constants.pound_force / constants.foot**2),
-    "inhg": Unit("pressure", 1000.0 * constants.inch * constants.mmHg),
-    "mmhg": Unit("pressure", constants.mmHg),
-    "1": Unit("fraction", 1.0),
-    "percent": Unit("fraction", 0.01),
-}
+# SI is ``factor * value + offset``: lengths, forces and temperatures by `scipy.constants`, g as the standard gravity
+_UNITS = csv.DictReader(files("flightmodel").joinpath("data", "units.csv").read_text(encoding="utf-8").splitlines())
+UNITS = {row["unit"]: Unit(row["kind"], float(row["factor"]), float(row["offset"])) for row in _UNITS}
 _LETTER = r"A-Za-z\u00b5\u03bc\u00b0"  # with both signs of micro, and the degree
 _RAISED = str.maketrans("\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079\u207b", "0123456789-")
 _READABLE = re.compile(rf"[{_LETTER}][{_LETTER}0-9_/*^.()\- ]{{1,39}}")

@@ -55,31 +55,23 @@ if TYPE_CHECKING:
 
 # imported on first use, so that `postflight --help` answers at once
 _DOOR = {
-    "GateError": "flightmodel.checks",
-    "read_flight": "postflight.flight",
-    "Flight": "postflight.flight",
-    "check_flight": "postflight.interface",
-    "reconstruct": "postflight.reconstruction",
-    "Settings": "recon.settings",
-    "Reconstruction": "postflight.reconstruction",
-    "Trajectory": "flightmodel.trajectory",
-    "air_data": "postflight.reconstruction",
-    "estimate_camera": "postflight.deflections",
-    "estimate_misalignment": "postflight.deflections",
-    "estimate_trim": "postflight.deflections",
-    "fuse": "postflight.deflections",
-    "aero_increments": "postflight.deflections",
-    "AeroIncrements": "postflight.flown_coefficients",
-    "Deflections": "postflight.deflections",
-    "DeflectionHistory": "flightmodel.deflection",
-    "read_vehicle": "flightmodel.vehicle",
-    "read_scenario": "synthetic_flight.scenarios",
-    "simulate": "postflight.interface",
-    "score": "postflight.interface",
-    "monte_carlo": "postflight.interface",
-    "reconcile": "postflight.reconciliation.command",
-    "compare": "postflight.interface",
-    "write_report": "postflight.interface",
+    name: module
+    for module, names in {
+        "flightmodel.checks": "GateError",
+        "postflight.flight": "read_flight Flight",
+        "postflight.interface": "check_flight simulate score monte_carlo compare write_report",
+        "postflight.reconstruction": "reconstruct Reconstruction air_data",
+        "recon.settings": "Settings",
+        "flightmodel.trajectory": "Trajectory",
+        "postflight.deflections": "Deflections aero_increments estimate_camera estimate_misalignment estimate_trim "
+        "fuse",
+        "postflight.flown_coefficients": "AeroIncrements",
+        "flightmodel.deflection": "DeflectionHistory",
+        "flightmodel.vehicle": "read_vehicle",
+        "synthetic_flight.scenarios": "read_scenario",
+        "postflight.reconciliation.command": "reconcile",
+    }.items()
+    for name in names.split()
 }
 
 __all__ = [

@@ -16,7 +16,8 @@ from flightmodel.geomagnetism_and_sun import sun_direction_ecef
 from flightmodel.instruments import dcm_body_from_sun_head
 from flightmodel.refraction import site_radius_m
 from flightmodel.sensor_tables import _winds
-from flightmodel.trajectory import Trajectory, difference, move_point, resample
+from flightmodel.trajectory import Trajectory, difference, resample
+from tests.oracles.moved_point import move_point
 from tests.oracles.plain_balance import left_jacobian
 from tests.oracles.strapdown import gravitation_gradient
 

@@ -5,12 +5,12 @@ import pytest
 
 from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, GateError
-from flightmodel.trajectory import move_point
 from synthetic_flight import sensing
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.instrument_errors import Dropouts, Gnss
 from synthetic_flight.scenarios import child_rng, fly_scenario, read_scenario
 from synthetic_flight.weather import day_of_flight_atmosphere, sense_atmosphere
+from tests.oracles.moved_point import move_point
 from tests.refusing import refuses
 
 
