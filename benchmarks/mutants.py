@@ -3,7 +3,8 @@
 Each entry of mutants.toml names a package, a piece of its source that stands there exactly once, and what an error
 would have written instead. An entry says nothing of the file, so that files may be renamed and merged. The tree is
 copied once for every worker; in the copy the error is planted, the package's own fast tests (not slow, not long) are
-run until one fails, and the source is put back. Compiled kernels (``*_kernels.py``) run interpreted.
+run until one fails, and the source is put back. With an error in a kernel all kernels run interpreted; with one in
+other code of a module that holds kernels all are compiled anew.
 
 Which tests run first: those that called the function that holds the error, as one recorded run of the package's fast
 tests found, the quick ones first. Calls of compiled kernels cannot be recorded, so entries in kernels name their test
@@ -46,6 +47,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("flightmodel", "recon", "estimators", "synthetic_flight", "postflight")
 FAST = "not slow and not long and not browser and not realdata"
 LONGEST_S = 420  # of processor time: an error may also make a loop endless
+KERNELS = {"kernel", "inlined"}  # their decorators
 RECORD = "POSTFLIGHT_MUTANTS_RECORD"
 MOST_NAMED = 400  # tests by name in one command line
 FIRST = 10  # of the tests that run a line, so many are tried before all others: collecting takes time too
@@ -67,10 +69,7 @@ class Mutant:
     explained: str = ""
     path: Path = Path()
     line: int = 0
-
-    @property
-    def in_kernel(self) -> bool:
-        return self.path.name.endswith("_kernels.py")
+    in_kernel: bool = False
 
 
 # ---- entries -------------------------------------------------------------------------------------------------------
@@ -97,10 +96,22 @@ def read_entries(tree: Path) -> list[Mutant]:
                 except SyntaxError as wrong:
                     faults.append(f"{package}: {one.error}: does not parse: {wrong}")
                 line = sources[path].count("\n", 0, start) + 1
-                found.append(Mutant(**{**one.__dict__, "path": path.relative_to(tree), "line": line}))
+                place = {"path": path.relative_to(tree), "line": line, "in_kernel": is_compiled(sources[path], line)}
+                found.append(Mutant(**{**one.__dict__, **place}))
     if faults:
         sys.exit("mutants.toml:\n" + "\n".join(faults))
     return found
+
+
+def is_compiled(source: str, line: int) -> bool:
+    """Whether a line is of a kernel, of a part of one, or of a constant that one of its module reads."""
+    body = ast.parse(source).body
+    kernels = [n for n in body if isinstance(n, ast.FunctionDef) and KERNELS & set(map(ast.unparse, n.decorator_list))]
+    (holder,) = (n for n in body if n.lineno <= line <= (n.end_lineno or 0))
+    if isinstance(holder, (ast.FunctionDef, ast.ClassDef)):
+        return holder in kernels
+    stored = {n.id for n in ast.walk(holder) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+    return any(isinstance(n, ast.Name) and n.id in stored for one in kernels for n in ast.walk(one))
 
 
 def callers_keys(tree: Path, one: Mutant) -> set[str]:
@@ -362,6 +373,8 @@ def plant(server: Server, one: Mutant, calls: dict[str, dict], whole: bool) -> d
     stages = [tests[:FIRST], tests[FIRST:]] if not one.tests else [tests]
     stages += [[f"tests/{one.package}"]] if whole else []
     state, by, seconds = "passed", "", 0.0
+    compiled = Path(environment(server.tree, False)["NUMBA_CACHE_DIR"])
+    kept = set(compiled.glob("kernels-*"))
     write(path, text.replace(one.was, one.now))
     try:
         for number, stage in enumerate(stages):
@@ -372,6 +385,8 @@ def plant(server: Server, one: Mutant, calls: dict[str, dict], whole: bool) -> d
     finally:
         write(path, text)
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+        for folder in set(compiled.glob("kernels-*")) - kept:  # of the source with the error
+            shutil.rmtree(folder)
     fate = {"passed": "survived", "failed": "killed", "endless": "killed"}.get(state, "broken")
     return {"fate": fate, "by": by, "seconds": round(seconds, 1), "tests": len(tests), "whole": whole}
 

@@ -1,9 +1,10 @@
 """Compiled primitives of the Earth and of attitudes, shared by the simulator's and the filter's kernels.
 
 Readable twins: `flightmodel.earth`, `flightmodel.rotations`. Importing this module also points numba's cache at a
-folder whose name carries a hash of every kernel source and the processor: numba does not notice a change in a callee
-of another file, so a stale cache must not be reachable. Where the user's cache cannot be written, as in a container
-with a read-only file system, the folder is a temporary one of this process: that costs time, never the command.
+folder whose name carries a hash of the processor and of every module that imports this one: numba does not notice a
+change in a callee of another file, so a stale cache must not be reachable. Where the user's cache cannot be written,
+as in a container with a read-only file system, the folder is a temporary one of this process: that costs time, never
+the command.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import hashlib
 import importlib.util
 import math
 import os
+import re
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +29,8 @@ from numba.core.registry import CPUDispatcher
 
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
+# a module that may hold kernels: it imports this one
+HOLDS_KERNELS = re.compile(rb"^from flightmodel(\._kernels import| import ([^\n]*|\([^)]*)\b_kernels\b)", re.MULTILINE)
 REMEDY = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that may be written"
 
 
@@ -80,11 +84,13 @@ def _writable(folder: Path) -> Path:
 
 def _point_cache_at_these_sources() -> CacheFolder:
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
-    for package in ("flightmodel", "recon", "estimators", "synthetic_flight"):
+    for package in ("flightmodel", "recon", "estimators", "synthetic_flight", "postflight"):
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
-            for source in sorted(Path(folder).glob("*_kernels.py")):
-                digest.update(source.name.encode() + source.read_bytes())
+            for source in sorted(Path(folder).rglob("*.py")):
+                text = source.read_bytes()
+                if source.name == "_kernels.py" or HOLDS_KERNELS.search(text):
+                    digest.update(str(source.relative_to(folder)).encode() + text)
     cache = _cache_folder(f"kernels-{digest.hexdigest()[:16]}")
     numba.config.CACHE_DIR = str(cache.path or "")
     return cache

@@ -17,7 +17,7 @@ DOORS = {
     "filterpy": {"recon/ekf.py"},
     "ppigrf": {"flightmodel/geomagnetism_and_sun.py"},
     "erfa": {"flightmodel/earth.py", "flightmodel/geomagnetism_and_sun.py"},
-    "numba": "_kernels.py",
+    "numba": {"flightmodel/_kernels.py"},  # elsewhere by its decorators
     "matplotlib": "postflight/plots/",
 }
 UNITS = ("deg", "km", "ft", "degps")
@@ -38,15 +38,13 @@ def imports(tree):
 @pytest.mark.parametrize("path", CODE, ids=name)
 def test_file_is_short_and_keeps_to_the_doors(path):
     text = path.read_text()
-    assert len(text.splitlines()) <= 800, "files stay below 800 lines"
+    assert len(text.splitlines()) <= 1200, "files stay below 1,200 lines"
     for module in imports(ast.parse(text)):
         door = DOORS.get(module.split(".")[0])
         if isinstance(door, set):
             assert name(path) in door, f"{module} has one door"
-        elif door and door.endswith("/"):
-            assert name(path).startswith(door), f"{module} is imported in {door} alone"
         elif door:
-            assert path.name.endswith(door), f"{module} is imported in files named {door} alone"
+            assert name(path).startswith(door), f"{module} is imported in {door} alone"
 
 
 # a value of a colour: by digits, by matplotlib's cycle or grey level, or by name

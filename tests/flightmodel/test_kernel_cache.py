@@ -8,7 +8,10 @@ import sys
 import time
 from pathlib import Path
 
+from flightmodel._kernels import HOLDS_KERNELS
+
 ROOT = Path(__file__).parents[2]
+PACKAGES = ("flightmodel", "recon", "estimators", "synthetic_flight", "postflight")
 FLY = """
 import numpy as np
 from flightmodel import _kernels
@@ -26,9 +29,9 @@ def run(tree, cache):
     return Path(folder), float(value)
 
 
-def test_an_edit_of_any_kernel_file_leaves_the_old_cache_behind(tmp_path):
+def test_an_edit_of_any_file_with_kernels_leaves_the_old_cache_behind(tmp_path):
     tree, cache = tmp_path / "tree", tmp_path / "cache"
-    for package in ("flightmodel", "synthetic_flight", "recon", "estimators"):
+    for package in PACKAGES:
         shutil.copytree(ROOT / package, tree / package, ignore=shutil.ignore_patterns("__pycache__"))
     before, value = run(tree, cache)
     assert run(tree, cache) == (before, value)
@@ -40,7 +43,7 @@ def test_an_edit_of_any_kernel_file_leaves_the_old_cache_behind(tmp_path):
     after, changed = run(tree, cache)
     assert after != before
     assert changed == value + 1.0
-    # any file of kernels counts, as its constants may be frozen into the machine code of others
+    # any file with kernels counts, as its constants may be frozen into the machine code of others
     layout = tree / "flightmodel" / "_raster_kernels.py"
     layout.write_text(layout.read_text() + "\n# moved\n")
     assert run(tree, cache)[0] not in (before, after)
@@ -98,9 +101,10 @@ def test_processes_that_save_at_once_keep_every_signature_s_own(tmp_path):
 def test_no_kernel_calls_another():
     """What is called by kernels is a part, which is one function with its caller: it has one set of bits."""
     decorated, called = {}, set()
-    for source in sorted(ROOT.glob("*/**/_*kernels.py")):
+    for source in (p for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))):
         for node in ast.parse(source.read_text()).body:
-            if isinstance(node, ast.FunctionDef) and node.decorator_list:
+            if isinstance(node, ast.FunctionDef) and {"kernel", "inlined"} & set(map(ast.unparse, node.decorator_list)):
+                assert source.name == "_kernels.py" or HOLDS_KERNELS.search(source.read_bytes()), f"{source}: no hash"
                 decorated[node.name] = ast.unparse(node.decorator_list[0])
                 calls = (each.func for each in ast.walk(node) if isinstance(each, ast.Call))
                 called |= {ast.unparse(function).rsplit(".")[-1] for function in calls}
