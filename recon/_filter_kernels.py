@@ -14,31 +14,11 @@ import numpy as np
 
 from flightmodel._kernels import boxplus, geodetic, inlined, kernel, multiply, small_cholesky, small_solve
 from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
-from recon._propagation_kernels import propagate_ballistic, propagate_strapdown
+from recon.propagation import level_transition, propagate_ballistic, propagate_strapdown
 
 TWO_PI = 2.0 * math.pi
 LEAST_DECAY = 1e-3  # the smoother divides by it; an error decorrelated to a thousandth is decorrelated
 LEAST_PIVOT = 1e-14  # of a correlation matrix; below it a direction is known exactly
-
-
-@inlined
-def level_transition(phi, noise):
-    """Set the transition to the identity and its noise to zero."""
-    for i in range(9):
-        for j in range(phi.shape[1]):
-            phi[i, j] = 1.0 if i == j else 0.0
-        for j in range(9):
-            noise[i, j] = 0.0
-
-
-@kernel
-def propagate_one(motion, first, last, errors, position, velocity, q, phi, noise):
-    """Carry a state in place between grid points with its transition ``phi`` (9, D) and ``noise`` (9, 9)."""
-    level_transition(phi, noise)
-    if motion.ballistic:
-        propagate_ballistic(motion, first, last, errors, position, velocity, phi, noise)
-    else:
-        propagate_strapdown(motion, first, last, errors, position, velocity, q, phi, noise)
 
 
 @inlined

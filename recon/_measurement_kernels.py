@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined
-from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
+from recon.propagation import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
 SLOTS = 23

@@ -1,10 +1,9 @@
-"""Ballistic motion with its transition and noise in numpy: readable twin of `recon._propagation_kernels`."""
+"""Ballistic motion with its transition and noise in numpy: readable twin of `recon.propagation`."""
 
 import numpy as np
 
 from flightmodel import earth, rotations
-from recon._propagation_kernels import MOST_CHANGE, MOST_PARTS
-from recon.propagation import Step
+from recon.propagation import MOST_CHANGE, MOST_PARTS, Step
 from recon.state import States
 
 

@@ -1,4 +1,4 @@
-"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon._propagation_kernels`."""
+"""Strapdown mechanisation with its transition and noise in numpy: readable twin of `recon.propagation`."""
 
 import numpy as np
 
