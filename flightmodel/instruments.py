@@ -4,7 +4,7 @@ Each instrument is one record in SI: where it sits, and one row an error. A row 
 flight.toml, the error states it becomes in the filter, and the sizes from which the simulator draws it. From the rows
 follow the keys of flight.toml (`RadarEntry`, ...), the filter's blocks (`recon.state`), the keys of a scenario
 file and the lines of flight.toml that a synthetic flight gets (`synthetic_flight.instrument_errors`). What is left to
-write for a new error is its partial derivative in `recon._measurement_kernels`.
+write for a new error is its partial derivative in `recon.measurements`.
 
 Every error is a constant of the flight, normal about zero with the stated standard deviation, unless its row names a
 time constant: then it is first-order Gauss-Markov. Standard deviations stand in files as an analyst writes them, angles

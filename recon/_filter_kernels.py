@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from flightmodel._kernels import boxplus, geodetic, inlined, kernel, multiply, small_cholesky, small_solve
-from recon._measurement_kernels import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
+from recon.measurements import DECELERATION, RADAR, SLOTS, SUN, node_motion, predict, predict_deceleration
 from recon.propagation import level_transition, propagate_ballistic, propagate_strapdown
 
 TWO_PI = 2.0 * math.pi

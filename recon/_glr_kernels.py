@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from flightmodel._kernels import inlined, kernel, multiply
-from recon._measurement_kernels import SLOTS
+from recon.measurements import SLOTS
 
 
 @kernel

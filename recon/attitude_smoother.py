@@ -51,8 +51,7 @@ from flightmodel.geomagnetism_and_sun import magnetic_field_ecef_t, sun_directio
 from flightmodel.instruments import SunHeads, TriadSpec, direction_from_sun_angles, sun_angles_from_direction
 from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import SunRecord, TriadRecord
-from recon._measurement_kernels import SLOTS
-from recon.measurements import magnetometer_model, sun_model
+from recon.measurements import SLOTS, magnetometer_model, sun_model
 from recon.state import AXES
 
 Position = Callable[[FloatArray], FloatArray]

@@ -40,9 +40,8 @@ from scipy.special import ndtri
 from flightmodel.checks import BoolArray, Check, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from recon._measurement_kernels import DECELERATION, RADAR
 from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem, jacobian
-from recon.measurements import REST, SLOT_NAMES
+from recon.measurements import DECELERATION, RADAR, REST, SLOT_NAMES
 from recon.settings import Settings
 from recon.smoother import Smoothed, smoothed_covariance
 from recon.state import KINEMATIC, States, boxminus, unpacked

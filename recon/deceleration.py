@@ -13,8 +13,8 @@ from flightmodel import earth
 from flightmodel.checks import Check, FloatArray
 from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Telemetry
-from recon._measurement_kernels import DECELERATION
 from recon.ekf import ForwardPass, Problem
+from recon.measurements import DECELERATION
 from recon.state import States
 
 _LEAST_QUIET = 20  # readings: a second of them

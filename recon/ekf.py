@@ -38,8 +38,7 @@ from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray, IntArray
 from flightmodel.trajectory import nearest_index
 from recon import _filter_kernels
-from recon._measurement_kernels import RADAR, SLOTS
-from recon.measurements import Instrument, servo_lag, wrapped
+from recon.measurements import RADAR, SLOTS, Instrument, servo_lag, wrapped
 from recon.propagation import SAME_INSTANT_S, Motion
 from recon.settings import COMPILED
 from recon.state import KINEMATIC, ErrorModel, States, boxminus, boxplus, packed

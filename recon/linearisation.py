@@ -31,9 +31,9 @@ import numpy as np
 
 from flightmodel.checks import Check, FloatArray, IntArray
 from recon import ekf, propagation, setup, single_faults, smoother
-from recon._measurement_kernels import DECELERATION
 from recon.ekf import Problem, with_servo_lag
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
+from recon.measurements import DECELERATION
 from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
 

@@ -57,7 +57,6 @@ from recon import (
     time_bias,
     tracker_time,
 )
-from recon._measurement_kernels import DECELERATION
 from recon.consistency import held_out_table
 from recon.deceleration import deceleration_checks
 from recon.ekf import Problem, with_servo_lag
@@ -72,6 +71,7 @@ from recon.fault_detection import (
 from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
 from recon.imu_screening import BridgedSensor
 from recon.linearisation import SpinPhase
+from recon.measurements import DECELERATION
 from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem

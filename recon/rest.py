@@ -28,8 +28,7 @@ from scipy.special import ndtri
 from flightmodel import earth, geomagnetism_and_sun, rotations
 from flightmodel.checks import Check, FloatArray, GateError, Issue
 from flightmodel.telemetry import AttitudePrior, RestReadings, Telemetry, TriadRecord, mean_readings
-from recon._measurement_kernels import FIELD, VELOCITY
-from recon.measurements import REST, Instrument, instrument_of
+from recon.measurements import FIELD, REST, VELOCITY, Instrument, instrument_of
 
 _LEVEL_SD_RAD = float(np.deg2rad(5.0))  # of the levelled prior, which zero velocities measure to a tenth of a degree
 _MOST_HEADING_RAD = float(np.deg2rad(30.0))  # beyond it linearisation fails

@@ -16,8 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from flightmodel.checks import FloatArray
-from recon._measurement_kernels import RADAR
-from recon.measurements import Instrument, sight, sight_partials, wrapped
+from recon.measurements import RADAR, Instrument, sight, sight_partials, wrapped
 
 _BRIDGED_S = 3.0  # over which a parabola's chord is off by some tens of metres at 10 m/s2: enough to linearise about
 _WORST_SD_M = 5e3  # of a point: beyond it the filter would linearise far from the path

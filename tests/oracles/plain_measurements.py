@@ -1,4 +1,4 @@
-"""Predictions of every kind of measurement and their partials: numpy twin of `recon._measurement_kernels.predict`."""
+"""Predictions of every kind of measurement and their partials: numpy twin of `recon.measurements.predict`."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,19 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.earth import WGS84, Planet
-from recon._measurement_kernels import FIELD, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
-from recon.measurements import magnetometer_model, sight, sight_partials, sun_model
+from recon.measurements import (
+    FIELD,
+    POSITION,
+    RADAR,
+    RANGE_RATE,
+    SLOTS,
+    SUN,
+    VELOCITY,
+    magnetometer_model,
+    sight,
+    sight_partials,
+    sun_model,
+)
 
 
 @dataclass(frozen=True)

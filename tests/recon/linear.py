@@ -11,8 +11,8 @@ import numpy as np
 
 from recon import _filter_kernels as kernels
 from recon import smoother
-from recon._measurement_kernels import SLOTS
 from recon.ekf import Filtered, Innovations, Observed, Steps, full_step, make_filter, schmidt_update
+from recon.measurements import SLOTS
 from recon.settings import COMPILED
 from recon.state import Wander, packed
 from tests.oracles import bryson_frazier, plain_smoother

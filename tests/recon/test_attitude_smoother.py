@@ -7,8 +7,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from recon import attitude_smoother as smoother
-from recon._measurement_kernels import FIELD, SLOTS, SUN
-from recon.measurements import Instrument
+from recon.measurements import FIELD, SLOTS, SUN, Instrument
 from tests.oracles.plain_measurements import NodeMotion, predict
 
 from .conftest import EPOCH, MAGNETOMETER

@@ -8,9 +8,16 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, TriadSpec, sun_angles_from_direction
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, TriadRecord
-from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
 from recon.measurements import (
+    FIELD,
+    HEIGHT,
+    POSITION,
+    RADAR,
+    RANGE_RATE,
     SLOT_NAMES,
+    SLOTS,
+    SUN,
+    VELOCITY,
     Instrument,
     barometer_instrument,
     gnss_instruments,

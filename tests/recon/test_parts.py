@@ -12,7 +12,6 @@ from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
 from recon import reconstruct
-from recon._measurement_kernels import RADAR
 from recon.consistency import source_checks
 from recon.entry_density import _spread, drag_jump_check, temperature_check
 from recon.fault_isolation import _compared
@@ -25,7 +24,7 @@ from recon.imu_screening import (
     bridge,
     repeat_by_noise,
 )
-from recon.measurements import gnss_instruments, magnetometer_instrument
+from recon.measurements import RADAR, gnss_instruments, magnetometer_instrument
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
 from recon.reconstruct import Mounting, corrected_series, datum_trajectory, turned_velocity_cov
 from recon.setup import fit_start

@@ -15,9 +15,8 @@ import pandas as pd
 import pytest
 
 from flightmodel import earth
-from recon._measurement_kernels import HEIGHT, SLOTS
 from recon.ekf import Observed, Problem, Steps, forward, observe
-from recon.measurements import Instrument
+from recon.measurements import HEIGHT, SLOTS, Instrument
 from recon.propagation import propagate, strapdown_motion
 from recon.settings import ENGINES
 from recon.smoother import smooth

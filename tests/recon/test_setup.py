@@ -10,7 +10,7 @@ from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
-from recon._measurement_kernels import RADAR, RANGE_RATE, VELOCITY
+from recon.measurements import RADAR, RANGE_RATE, VELOCITY
 from recon.propagation import inertial_motion
 from recon.reconstruct import bridge_inertial_sensors, reconstruct
 from recon.settings import Settings

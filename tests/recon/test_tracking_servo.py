@@ -10,8 +10,7 @@ from flightmodel import earth
 from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.instruments import RadarEntry
-from recon._measurement_kernels import RADAR
-from recon.measurements import Instrument, servo_lag
+from recon.measurements import RADAR, Instrument, servo_lag
 from recon.reconstruct import reconstruct, reconstruct_once
 from recon.settings import Settings
 from recon.state import States
