@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from recon.ekf import full_step, measured_rows
-from recon.smoother import Smoothed, store_moments
+from recon.smoother import Smoothed, keep_moments
 from recon.state import unpacked
 
 
@@ -38,7 +38,7 @@ def bryson_frazier(steps, run, observed, slots, innovations, x, triangles, varia
             mean, information, _ = _before(observed, slots, innovations, row, mean, information)
         p = unpacked(run.p_minus[k])
         x[k] = run.x_minus[k] - p @ mean
-        store_moments(run, k, p - p @ information @ p, triangles, variance)
+        keep_moments(run, k, p - p @ information @ p, triangles, variance)
         if k > 0:
             f, _ = full_step(steps, k - 1)
             mean, information = f.T @ mean, f.T @ information @ f

@@ -1,9 +1,9 @@
-"""Rauch-Tung-Striebel's smoother in numpy: readable twin of `recon._filter_kernels.rauch_tung_striebel`."""
+"""Rauch-Tung-Striebel's smoother in numpy: readable twin of `recon.smoother.rauch_tung_striebel`."""
 
 import numpy as np
 
 from recon.ekf import full_step
-from recon.smoother import store_moments
+from recon.smoother import keep_moments
 from recon.state import unpacked
 
 
@@ -38,7 +38,7 @@ def step_gain(transition, noise, p_next, moving):
 def rauch_tung_striebel(steps, run, moving, x, triangles, variance):
     """Smooth ``x`` (n, N), which comes as the filtered errors, in place; moments at kept nodes where wanted."""
     p = run.p_last.copy()
-    store_moments(run, len(x) - 1, p, triangles, variance)
+    keep_moments(run, len(x) - 1, p, triangles, variance)
     for k in reversed(range(len(x) - 1)):
         f, q = full_step(steps, k)
         prior = unpacked(run.p_minus[k + 1])
@@ -50,4 +50,4 @@ def rauch_tung_striebel(steps, run, moving, x, triangles, variance):
         p[moving], p[:, moving] = rows, rows.T
         block = rows @ c.T + added
         p[np.ix_(moving, moving)] = 0.5 * (block + block.T)
-        store_moments(run, k, p, triangles, variance)
+        keep_moments(run, k, p, triangles, variance)

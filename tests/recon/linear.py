@@ -1,7 +1,7 @@
 """Linear problems in the filter's block form, taken through the filter's own arithmetic and solved by brute force.
 
 A problem is given by its steps and measurements; nothing of a flight stands behind it. `run` chains the very kernels
-of which `recon._filter_kernels.forward` consists (or filterpy's filter with `recon.ekf.schmidt_update`), so that the
+of which `recon.ekf.forward_compiled` consists (or filterpy's filter with `recon.ekf.schmidt_update`), so that the
 smoothers can be run on what comes out.
 """
 
@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon import _filter_kernels as kernels
-from recon import smoother
+from recon import ekf, smoother
 from recon.ekf import Filtered, Innovations, Observed, Steps, full_step, make_filter, schmidt_update
 from recon.measurements import SLOTS
 from recon.settings import COMPILED
@@ -95,7 +94,7 @@ def run(problem, engine=COMPILED):
 
 
 class _Compiled:
-    """The kernels that `recon._filter_kernels.forward` chains."""
+    """The kernels that `recon.ekf.forward_compiled` chains."""
 
     def __init__(self, problem, out, innovations):
         self.problem, self.innovations = problem, innovations
@@ -103,10 +102,10 @@ class _Compiled:
 
     def step(self, j, offset):
         s, x = self.problem.steps, np.empty_like(self.x)
-        kernels.linear_step(self.x, s.transition[j], s.decay[j], x)
+        ekf.linear_step(self.x, s.transition[j], s.decay[j], x)
         self.x = x + offset
         moving = len(self.problem.moving) > 9
-        kernels.predict_covariance(self.p, s.transition[j], s.noise[j], s.decay[j], s.noise_var[j], moving, self.rows)
+        ekf.predict_covariance(self.p, s.transition[j], s.noise[j], s.decay[j], s.noise_var[j], moving, self.rows)
 
     def use(self, row):
         problem, v = self.problem, self.innovations
@@ -116,11 +115,11 @@ class _Compiled:
         w = np.empty((3, len(self.x)))
         count = len(used)
         for r, i in enumerate(used):
-            y[r] = problem.observed.value[row, i] - kernels.times(v.by_state[row, i], v.by_error[row, i], slot, self.x)
-        kernels.cross_covariance(self.p, v.by_state[row], v.by_error[row], slot, count, s, used, w)
-        kernels.record(v, row, s, y, used, count, variance)
-        kernels.small_cholesky(s, count, factor)
-        kernels.gain_and_update(
+            y[r] = problem.observed.value[row, i] - ekf.times(v.by_state[row, i], v.by_error[row, i], slot, self.x)
+        ekf.cross_covariance(self.p, v.by_state[row], v.by_error[row], slot, count, s, used, w)
+        ekf.record(v, row, s, y, used, count, variance)
+        ekf.small_cholesky(s, count, factor)
+        ekf.gain_and_update(
             self.x, self.p, w, y, factor, count, used, problem.wander.considered, problem.wander.sd, v.gain[row]
         )
 
@@ -166,7 +165,7 @@ def smooth(problem, out, innovations, method):
         )
     else:
         x = out.x_plus.copy()
-        one = plain_smoother if method.startswith("plain") else kernels
+        one = plain_smoother if method.startswith("plain") else smoother
         one.rauch_tung_striebel(problem.steps, out, problem.moving, x, triangles, variance)
     return x, triangles, variance
 

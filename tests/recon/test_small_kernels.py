@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from recon import _filter_kernels, ekf, propagation
+from recon import ekf, propagation
 from recon._glr_kernels import offset_scores
 from recon.propagation import correct, propagate, strapdown_motion, with_exact_integrals
 from recon.settings import ENGINES, FILTERPY
@@ -70,7 +70,7 @@ def test_chart_turns_with_the_right_jacobian():
     d, step = np.array([0.06, -0.08, 0.03]), 1e-5
     phi = np.zeros((9, 9))
     phi[6:9, 6:9] = np.eye(3)
-    _filter_kernels.right_jacobian_columns(phi, *d)
+    ekf.right_jacobian_columns(phi, *d)
     reference = rotations.exp(d)
     for j in range(3):
         e = step * np.eye(3)[j]
@@ -90,7 +90,7 @@ def test_wander_keeps_its_stated_size():
     wander = Wander(tau, length, sd, walk, np.zeros(4, dtype=bool))
     decay, new = np.empty(4), np.empty(4)
     for dt, climb in ((0.5, 30.0), (7.0, 900.0)):
-        assert _filter_kernels.decay_and_noise(wander, dt, climb, decay, new)
+        assert ekf.decay_and_noise(wander, dt, climb, decay, new)
         forgets = [0, 1, 3]
         np.testing.assert_allclose((decay**2 * sd**2 + new)[forgets], sd[forgets] ** 2, rtol=1e-12)
         np.testing.assert_allclose(-np.log(decay[forgets]), (dt / tau + climb / length)[forgets], rtol=1e-12)
