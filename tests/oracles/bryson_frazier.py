@@ -45,7 +45,7 @@ def bryson_frazier(steps, run, observed, slots, innovations, x, triangles, varia
 
 
 def offset_scores(steps, observed, slots, innovations, columns, begin, end):
-    """Score (c,) and covariance (c, c) of one window; readable twin of `recon._glr_kernels.offset_scores`."""
+    """Score (c,) and covariance (c, c) of one window; readable twin of `recon.fault_detection.window_scores`."""
     n, size = len(observed.first) - 1, innovations.gain.shape[1]
     mean, information, cross = np.zeros(size), np.zeros((size, size)), np.zeros((size, len(columns)))
     score, variance = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))

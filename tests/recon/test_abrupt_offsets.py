@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from flightmodel.telemetry import TriadRecord
-from recon import _glr_kernels
 from recon.ekf import forward
-from recon.fault_detection import unsupported_offsets
+from recon.fault_detection import unsupported_offsets, window_scores
 from recon.imu_screening import _REACH, TransientOffset, bridge, repeated_samples, transient_offsets
 from recon.reconstruct import bridge_inertial_sensors, reconstruct_once
 from recon.settings import Settings
@@ -182,7 +181,7 @@ def test_scores_are_the_likelihood_of_an_offset(seed):
     about = problem.steps, problem.observed, problem.slots, innovations, columns
     begin, end = np.array([9, 3, 3, 0]), np.array([13, 8, 5, 2])
     score, variance = np.zeros((4, 3)), np.zeros((4, 3, 3))
-    _glr_kernels.offset_scores(*about, begin, end, 3, score, variance)
+    window_scores(*about, begin, end, 3, score, variance)
     rng = np.random.default_rng(seed)
     for w in range(4):
         s, v = bryson_frazier.offset_scores(*about, begin[w], end[w])

@@ -7,7 +7,7 @@ import pytest
 
 from flightmodel import earth, rotations
 from recon import ekf, propagation
-from recon._glr_kernels import offset_scores
+from recon.fault_detection import window_scores
 from recon.propagation import correct, propagate, strapdown_motion, with_exact_integrals
 from recon.settings import ENGINES, FILTERPY
 from recon.state import States, Wander, unpacked
@@ -56,7 +56,7 @@ def test_glr_scores_are_those_of_the_numpy_form():
     columns = np.array([9, 10, 12])
     begin, end = np.array([7, 2], dtype=np.int64), np.array([11, 9], dtype=np.int64)
     score, variance = np.zeros((2, 3)), np.zeros((2, 3, 3))
-    offset_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
+    window_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
     for k in range(2):
         s, v = bryson_frazier.offset_scores(
             problem.steps, problem.observed, problem.slots, innovations, columns, int(begin[k]), int(end[k])
