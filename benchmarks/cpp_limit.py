@@ -15,8 +15,8 @@ import numpy as np
 from problem import PULSE_S, minima, reference_problem
 
 from flightmodel import earth
-from synthetic_flight import _kernels, simulate
-from synthetic_flight._kernels import AUX, STATES
+from synthetic_flight import dynamics, simulate
+from synthetic_flight.dynamics import AUX, STATES
 from synthetic_flight.simulate import DEFLECTION_LIMIT_RAD
 
 SOURCE = Path(__file__).parent / "plain_cpp" / "flight.cpp"
@@ -58,7 +58,7 @@ class Flights:
         steps = round(seconds / step)
         out, aux = np.empty((self.lanes, 2, STATES)), np.empty((self.lanes, 2, AUX))
         workspace, written = simulate.workspace(self.states, self.parameters), np.zeros(self.lanes, dtype=np.int64)
-        _kernels.integrate(
+        dynamics.integrate(
             (0,) * self.lanes,
             (),
             (),
@@ -78,7 +78,7 @@ class Flights:
 
     def cpp(self, function, seconds, step):
         """The same from C++."""
-        state, parameters = self.states.T.copy(), self.parameters[:, : _kernels.DELAYED].T.copy()
+        state, parameters = self.states.T.copy(), self.parameters[:, : dynamics.DELAYED].T.copy()
         arrays = [a.ctypes.data_as(DOUBLES) for a in self.tables]
         air, _, mach, coefficients, _ = (a.shape for a in self.tables)
         tables = Tables(*arrays, air[0], air[1], mach[0], coefficients[1])

@@ -20,8 +20,7 @@ from problem import PULSE_S, fly, reference_problem
 from scipy.integrate import solve_ivp
 
 from flightmodel import earth
-from synthetic_flight import _kernels, dynamics, simulate
-from synthetic_flight import _kernels as at
+from synthetic_flight import dynamics, simulate
 
 RATES_HZ = (500.0, 250.0, 200.0)
 STEP_HZ = 500.0
@@ -62,11 +61,14 @@ def dop853(problem, seconds, rtol):
     s = simulate.workspace(problem.entry[None], simulate.parameter_vector(problem.vehicle)[None])
     air, grid, mach, table, free = simulate.kernel_tables(problem.vehicle, problem.atmosphere)
     planet = tuple(earth.WGS84)  # numba takes a plain tuple several times faster than a named one
-    trial, rate = slice(at.TRIAL, at.TRIAL + at.STATES), slice(at.RATE, at.RATE + at.STATES)
+    trial, rate = (
+        slice(dynamics.TRIAL, dynamics.TRIAL + dynamics.STATES),
+        slice(dynamics.RATE, dynamics.RATE + dynamics.STATES),
+    )
 
     def derivative(_, y):
         s[trial] = y
-        _kernels.rates(s, (0,), (), (), air, grid, mach, table, free, planet, False, False)
+        dynamics.rates(s, (0,), (), (), air, grid, mach, table, free, planet, False, False)
         return s[rate].copy()
 
     times = np.linspace(0.0, seconds, round(seconds * 10.0) + 1)

@@ -40,12 +40,12 @@ def _vehicle_at_rest() -> tuple[Vehicle, FloatArray]:
 
 
 def _simulator() -> None:
-    from synthetic_flight._kernels import gauss_markov
+    from synthetic_flight.instrument_errors import unit_gauss_markov
     from synthetic_flight.simulate import integrate, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     integrate(vehicle, vacuum_table(), state, 0.001, 1, 2)
-    gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
+    unit_gauss_markov(np.zeros(1), np.zeros((2, 1)), np.zeros((2, 1)))
 
 
 def _fly_ensemble(creep: int) -> None:
@@ -63,7 +63,7 @@ def _ensembles() -> None:
 
 def _creep() -> None:
     """Of what a joint that creeps adds a reconciliation asks in every flight."""
-    from synthetic_flight._kernels import CREEP_STATES
+    from synthetic_flight.dynamics import CREEP_STATES
 
     _fly_ensemble(CREEP_STATES)
 

@@ -1,6 +1,6 @@
 """What do thousands of dispersed flights do: their peaks, and their histories over a window?
 
-Sixteen flights fly in the lanes of one kernel call (`synthetic_flight._kernels`), and kernel calls run in threads,
+Sixteen flights fly in the lanes of one kernel call (`synthetic_flight.dynamics`), and kernel calls run in threads,
 since compiled code holds no interpreter lock. Flight ``run`` is the same to the last bit in any company: every lane
 goes through the same instructions. Memory does not grow with the number of flights.
 

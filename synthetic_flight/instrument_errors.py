@@ -13,6 +13,7 @@ generator with a name of its own, so that adding one leaves the others as they w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -22,6 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from flightmodel import rotations
+from flightmodel._kernels import kernel
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.config import (
     Angle,
@@ -53,7 +55,6 @@ from flightmodel.instruments import (
 )
 from flightmodel.refraction import Refractivity
 from flightmodel.trajectory import interpolate_rows
-from synthetic_flight import _kernels
 
 CHILD = 0  # stands between an instrument's key and its child's: no name holds a NUL
 
@@ -145,6 +146,15 @@ def filtered(values: FloatArray, step_s: float, numerator: list[float], denomina
     return np.asarray(out)
 
 
+@kernel
+def unit_gauss_markov(keep, white, out):
+    """Gauss-Markov noise of unit variance into ``out`` (n, m); ``keep`` (n - 1,): correlation from row to row."""
+    for i in range(out.shape[1]):
+        out[0, i] = white[0, i]
+        for k in range(1, out.shape[0]):
+            out[k, i] = keep[k - 1] * out[k - 1, i] + math.sqrt(1.0 - keep[k - 1] * keep[k - 1]) * white[k, i]
+
+
 def gauss_markov(
     time_s: FloatArray, sd: float, time_constant_s: float, columns: int, rng: np.random.Generator
 ) -> FloatArray:
@@ -152,7 +162,7 @@ def gauss_markov(
     keep = np.exp(-np.diff(time_s) / time_constant_s)
     white = rng.standard_normal((len(time_s), columns))
     out = np.empty_like(white)
-    _kernels.gauss_markov(keep, white, out)
+    unit_gauss_markov(keep, white, out)
     return sd * out
 
 

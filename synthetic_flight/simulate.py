@@ -1,6 +1,6 @@
 """What is the true motion of a given vehicle in a given atmosphere from a given state?
 
-``y' = f(y, t)`` of two rigid bodies on a compliant joint (`synthetic_flight._kernels`), integrated by fourth-order
+``y' = f(y, t)`` of two rigid bodies on a compliant joint (`synthetic_flight.dynamics`), integrated by fourth-order
 Runge-Kutta with a fixed step; the joint may be locked until the aeroshell is inflated. A flight that tumbles is
 flagged, one whose deflection passes 90 deg ends there; neither is an error.
 
@@ -26,10 +26,8 @@ from flightmodel.events import splashdown_index
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import Vehicle
-from synthetic_flight import _kernels as at
 from synthetic_flight import dynamics
-from synthetic_flight._kernels import AUX, CREEP_STATES, STATES
-from synthetic_flight.dynamics import added_twist_inertia, check_step
+from synthetic_flight.dynamics import AUX, CREEP_STATES, STATES, added_twist_inertia, check_step
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +49,7 @@ class Truth(Tabular):
     trajectory : Trajectory
         Of the structural datum on the centerbody's axis, body attitude.
     state_eci : (n, 20) float
-        As integrated (`synthetic_flight._kernels`); (n, 22) where the joint creeps.
+        As integrated (`synthetic_flight.dynamics`); (n, 22) where the joint creeps.
     q_body_shell : (n, 4) float
     deflection : DeflectionHistory
         Method ``"truth"``.
@@ -275,12 +273,12 @@ def integrate_into(
     flights, _, width = out.shape
     lanes = lanes or flights
     written = np.zeros(flights, dtype=np.int64)
-    kinds = (0,) * lanes, (0,) * (width - STATES), (0,) * int(parameters[:, at.TERMS :].any())
+    kinds = (0,) * lanes, (0,) * (width - STATES), (0,) * int(parameters[:, dynamics.TERMS :].any())
     air, *tables = kernel_tables(vehicle, atmosphere, air_from_m)
-    spaces = workspace(states, parameters, schedule.step_s).reshape(at.ROWS, -1, lanes).transpose(1, 0, 2)
+    spaces = workspace(states, parameters, schedule.step_s).reshape(dynamics.ROWS, -1, lanes).transpose(1, 0, 2)
     for number, space in enumerate(np.ascontiguousarray(spaces)):
         block = slice(number * lanes, (number + 1) * lanes)
-        at.integrate(
+        dynamics.integrate(
             *kinds,
             space.ravel(),
             (air[block] if len(air) > 1 else air, *tables),
@@ -461,7 +459,7 @@ def _truth(
 
 
 def freeplay_corner(freeplay_rad: float, corner: float) -> tuple[float, float, float]:
-    """Arguments of `_kernels.beyond_freeplay` after the angle: freeplay, half width of its corner, 1 / (4 half)."""
+    """Arguments of `dynamics.beyond_freeplay` after the angle: freeplay, half width of its corner, 1 / (4 half)."""
     half = corner * freeplay_rad
     return freeplay_rad, half, 0.25 / half if half > 0.0 else 0.0
 
@@ -470,14 +468,14 @@ def parameter_vector(
     vehicle: Vehicle, ca: float = 1.0, cn: float = 1.0, cm: float = 1.0, cmq_shift: float = 0.0
 ) -> FloatArray:
     """Pack a vehicle for the kernels, (79,), with factors on its C_A, C_N and C_m and a shift of its C_mq."""
-    p = np.zeros(at.PARAMETERS)
+    p = np.zeros(dynamics.PARAMETERS)
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     upper = np.triu_indices(3)
     mb, ma = body.mass_kg, shell.mass_kg
-    p[: at.I_B] = mb, ma, 1.0 / mb, 1.0 / ma, ma / (mb + ma), -mb / (mb + ma), 1.0 / (mb + ma)
+    p[: dynamics.I_B] = mb, ma, 1.0 / mb, 1.0 / ma, ma / (mb + ma), -mb / (mb + ma), 1.0 / (mb + ma)
     for inertia_at, inverse_at, mobility_at, arm_at, part in (
-        (at.I_B, at.W_B, at.N_B, at.P_B, body),
-        (at.I_A, at.W_A, at.N_A, at.P_A, shell),
+        (dynamics.I_B, dynamics.W_B, dynamics.N_B, dynamics.P_B, body),
+        (dynamics.I_A, dynamics.W_A, dynamics.N_A, dynamics.P_A, shell),
     ):
         arm = vehicle.joint_m - part.cg_m
         lever, inverse = rotations.skew(arm), np.linalg.inv(part.inertia)
@@ -485,9 +483,9 @@ def parameter_vector(
         p[inverse_at : inverse_at + 6] = inverse[upper]
         p[mobility_at : mobility_at + 6] = (-lever @ inverse @ lever)[upper]
         p[arm_at : arm_at + 3] = arm
-    p[at.NOSE_A : at.NOSE_A + 3] = -shell.cg_m
+    p[dynamics.NOSE_A : dynamics.NOSE_A + 3] = -shell.cg_m
     freeplay = np.deg2rad(joint.freeplay_deg)
-    p[at.JOINT : at.JOINT + 9] = (
+    p[dynamics.JOINT : dynamics.JOINT + 9] = (
         joint.bending_stiffness_nmprad,
         joint.hardening_nmprad3,
         joint.torsion_stiffness_nmprad,
@@ -496,11 +494,11 @@ def parameter_vector(
         joint.torsion_damping_nmsprad,
         *freeplay_corner(freeplay, joint.freeplay_corner),
     )
-    p[at.REFERENCE : at.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
-    p[at.FACTOR : at.FACTOR + 4] = ca, cn, cm, cmq_shift
-    p[at.DELAYED : at.DELAYED + 2] = joint.delayed_compliance_radpnm, 1.0 / joint.creep_time_s
-    p[at.QUADRATIC] = joint.quadratic_nmprad2
-    p[at.TERMS :] = vehicle.aero_terms.numbers
+    p[dynamics.REFERENCE : dynamics.REFERENCE + 2] = vehicle.reference.area_m2, vehicle.reference.length_m
+    p[dynamics.FACTOR : dynamics.FACTOR + 4] = ca, cn, cm, cmq_shift
+    p[dynamics.DELAYED : dynamics.DELAYED + 2] = joint.delayed_compliance_radpnm, 1.0 / joint.creep_time_s
+    p[dynamics.QUADRATIC] = joint.quadratic_nmprad2
+    p[dynamics.TERMS :] = vehicle.aero_terms.numbers
     return p
 
 
@@ -560,14 +558,14 @@ def workspace(states: FloatArray, parameters: FloatArray, step_s: float = 0.0) -
 
     ``step_s`` is the integration's: the twist of a joint for which it is too long is slowed.
     """
-    s = np.zeros((at.ROWS, len(states)))
-    s[at.Y : at.Y + STATES] = states[:, :STATES].T
-    s[at.P : at.ADDED] = parameters.T
+    s = np.zeros((dynamics.ROWS, len(states)))
+    s[dynamics.Y : dynamics.Y + STATES] = states[:, :STATES].T
+    s[dynamics.P : dynamics.ADDED] = parameters.T
     if step_s > 0.0:
-        inertia = 1.0 / (1.0 / parameters[:, at.I_A] + 1.0 / parameters[:, at.I_B])
-        stiffness, damping = parameters[:, at.JOINT + 2], parameters[:, at.JOINT + 5]
-        s[at.ADDED] = added_twist_inertia(inertia, damping, stiffness, step_s)
-    s[at.CREEP : at.CREEP + states.shape[1] - STATES] = states[:, STATES:].T
+        inertia = 1.0 / (1.0 / parameters[:, dynamics.I_A] + 1.0 / parameters[:, dynamics.I_B])
+        stiffness, damping = parameters[:, dynamics.JOINT + 2], parameters[:, dynamics.JOINT + 5]
+        s[dynamics.ADDED] = added_twist_inertia(inertia, damping, stiffness, step_s)
+    s[dynamics.CREEP : dynamics.CREEP + states.shape[1] - STATES] = states[:, STATES:].T
     return s.ravel()
 
 

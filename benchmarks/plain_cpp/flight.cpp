@@ -1,4 +1,4 @@
-// The flight of synthetic_flight/_kernels.py in plain C++: the same equations, tables and constants, as a C++ author
+// The flight of synthetic_flight/dynamics.py in plain C++: the same equations, tables and constants, as a C++ author
 // would write them. `Number` is a double (one flight) or `Lanes` (flights side by side; no intrinsics). `Maths` says whose atan2 and exp: the library's, or the polynomials that our kernel uses.
 //
 // Built and called by benchmarks/cpp_limit.py.

@@ -12,7 +12,7 @@ from flightmodel._kernels import kernel
 def sense(states, aux, vehicle, arms, masses, simpson, window_s, windows, slope):
     """Means over windows of rates and specific force, and their rates of change, into (m, windows, 6) each.
 
-    ``states`` (m, records, 20 or 22) and ``aux`` (m, records, 18) as `synthetic_flight._kernels` has them, of the
+    ``states`` (m, records, 20 or 22) and ``aux`` (m, records, 18) as `synthetic_flight.dynamics` has them, of the
     vehicles numbered ``vehicle`` (m,): accelerometer from the centerbody's c.g. (k, 3), and the centerbody's mass (k,).
     """
     intervals = len(simpson) - 1

@@ -47,8 +47,7 @@ from postflight.reconciliation import _span_kernels
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
-from synthetic_flight._kernels import CREEP_STATES
-from synthetic_flight.dynamics import check_step, joint_modes
+from synthetic_flight.dynamics import CREEP_STATES, check_step, joint_modes
 from synthetic_flight.ensemble import LANES, available_cores, check_mass
 
 KNOT_M = 125.0  # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz
@@ -498,7 +497,7 @@ def _affine(values: FloatArray, responses: FloatArray) -> FloatArray:
 
 # of a span's start: rotation from the reconstructed attitude, body's rate, shell's rotation vector from the body (x is
 # its twist), shell's rate relative to the body, shell axes; velocity less the reconstructed one, ECEF; of a joint that
-# creeps its creep as `synthetic_flight._kernels` has it
+# creeps its creep as `synthetic_flight.dynamics` has it
 MOTION = 15
 ATTITUDE, RATE, DEFLECTION, DEFLECTION_RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 VELOCITY, CREEP = slice(12, 15), slice(15, 17)

@@ -15,7 +15,7 @@ PACKAGES = ("flightmodel", "recon", "estimators", "synthetic_flight", "postfligh
 FLY = """
 import numpy as np
 from flightmodel import _kernels
-from synthetic_flight import _kernels as flight
+from synthetic_flight import dynamics as flight
 print(_kernels.CACHE.path)
 print(flight.beyond_freeplay(0.2, 0.1, 0.01, 25.0))
 """
@@ -36,7 +36,7 @@ def test_an_edit_of_any_file_with_kernels_leaves_the_old_cache_behind(tmp_path):
     before, value = run(tree, cache)
     assert run(tree, cache) == (before, value)
     assert value == 0.2 - 0.1 - 0.01 + 0.02 * 0.02 * 25.0
-    source = tree / "synthetic_flight" / "_kernels.py"
+    source = tree / "synthetic_flight" / "dynamics.py"
     source.write_text(
         source.read_text().replace("theta - freeplay - half, 0.0)", "theta - freeplay - half, 0.0) + 1.0")
     )

@@ -2,7 +2,7 @@
 
 Each body obeys ``m a = F +/- Fc`` and ``I w' = T - w x I w +/- (p x Fc + tau)``; the joint's point has one
 acceleration: ``a_B + w_B' x p_B + w_B x (w_B x p_B) = a_A + ...``. Here the accelerations of both bodies and the
-constraint force are the 15 unknowns of one linear system; the compiled kernel (`synthetic_flight._kernels`) eliminates
+constraint force are the 15 unknowns of one linear system; the compiled kernel (`synthetic_flight.dynamics`) eliminates
 down to a 3x3 system (constraint force equation, seed paper section III). Both must give the same derivative.
 
 B is the centerbody (*body*), A the aeroshell (*shell*).
@@ -19,7 +19,7 @@ from flightmodel.atmosphere import AtmosphereProfile, gas_constant, mean_free_pa
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import lv_direction
 from flightmodel.vehicle import Vehicle
-from synthetic_flight.dynamics import beyond_freeplay, points, split, spring_deflection, twist
+from synthetic_flight.dynamics import angle_beyond_freeplay, points, split, spring_deflection, twist
 
 
 def creeping_moment(vehicle: Vehicle, state: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -32,7 +32,7 @@ def creeping_moment(vehicle: Vehicle, state: FloatArray) -> tuple[FloatArray, Fl
     def potential(angles: FloatArray) -> float:
         moved = state.copy()
         moved[6:10] = rotations.multiply(rotations.exp(angles), state[6:10])
-        d = beyond_freeplay(
+        d = angle_beyond_freeplay(
             np.linalg.norm(spring_deflection(moved)), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner
         )
         straight, hardening = 0.5 * joint.bending_stiffness_nmprad * d**2, 0.25 * joint.hardening_nmprad3 * d**4
@@ -40,7 +40,7 @@ def creeping_moment(vehicle: Vehicle, state: FloatArray) -> tuple[FloatArray, Fl
 
     slope = [(potential(turn * axis) - potential(-turn * axis)) / (2.0 * turn) for axis in np.eye(3)]
     felt = spring_deflection(state)
-    d = beyond_freeplay(np.linalg.norm(felt), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
+    d = angle_beyond_freeplay(np.linalg.norm(felt), np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
     force = spring_moment(vehicle, d) * felt / np.linalg.norm(felt)
     share = joint.creep_share / (1.0 - joint.creep_share)
     return -np.array(slope), (share * force / joint.bending_stiffness_nmprad - state[20:]) / joint.creep_time_s
@@ -60,7 +60,7 @@ def joint_moment(vehicle: Vehicle, q_b: FloatArray, q_a: FloatArray, rate_eci: F
     normal = np.cross(x_b, x_a)
     sine, cosine = np.linalg.norm(normal), x_b @ x_a
     theta = np.arctan2(sine, cosine)
-    d = beyond_freeplay(theta, np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
+    d = angle_beyond_freeplay(theta, np.deg2rad(joint.freeplay_deg), joint.freeplay_corner)
     spring = spring_moment(vehicle, d)
     moment = spring * normal / sine if sine > 0 else np.zeros(3)
     middle = x_b + x_a

@@ -24,7 +24,7 @@ from postflight.reconciliation.forward_model import (
 )
 from postflight.reconciliation.gauss_newton import Parameters
 from postflight.reconciliation.posterior import quantities
-from synthetic_flight.dynamics import beyond_freeplay
+from synthetic_flight.dynamics import angle_beyond_freeplay
 from tests.refusing import refuses
 
 NOMINAL = vehicle_from_toml(vehicle_path("irve2_reference"))
@@ -45,7 +45,7 @@ def test_a_joint_with_freeplay_carries_the_plain_joints_moment(corner):
     loose = with_freeplay(SimpleNamespace(vehicle_parameters=parameters), plain, np.deg2rad(0.3), corner)
     size = np.linalg.norm(loose.motion[:, DEFLECTION], axis=1)
     expected = np.linalg.norm(motion[:, DEFLECTION], axis=1)
-    assert beyond_freeplay(size, np.deg2rad(0.3), corner) == pytest.approx(expected, rel=1e-9)
+    assert angle_beyond_freeplay(size, np.deg2rad(0.3), corner) == pytest.approx(expected, rel=1e-9)
     assert loose.motion[:, DEFLECTION] / size[:, None] == pytest.approx(motion[:, DEFLECTION] / expected[:, None])
     vehicle = parameters.vehicle(loose.vehicle)
     assert vehicle.joint.freeplay_deg == pytest.approx(0.3)

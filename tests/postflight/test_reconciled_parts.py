@@ -36,7 +36,7 @@ from postflight.reconciliation.gauss_newton import (
 from postflight.reconciliation.modes import HOP, PADDED, RATE_HZ, WINDOW, _spectra
 from postflight.reconciliation.normal_equations import ArrowMatrix, NormalEquations
 from postflight.reconciliation.posterior import joint_table, stiffness_bound
-from synthetic_flight.dynamics import beyond_freeplay, joint_modes
+from synthetic_flight.dynamics import angle_beyond_freeplay, joint_modes
 from tests.refusing import refuses
 
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
@@ -102,7 +102,7 @@ def test_a_loosened_joint_carries_the_plain_one_s_moment(corner):
     plain = Parameters(np.zeros(5), np.zeros(20), np.zeros((3, 4)), np.zeros(2), motion)
     made = with_freeplay(SimpleNamespace(vehicle_parameters=SimpleNamespace(names=names)), plain, freeplay, corner)
     bent = np.linalg.norm(made.motion[:, 7:9], axis=1)
-    np.testing.assert_allclose(beyond_freeplay(bent, freeplay, corner), sizes, rtol=1e-9)
+    np.testing.assert_allclose(angle_beyond_freeplay(bent, freeplay, corner), sizes, rtol=1e-9)
     np.testing.assert_allclose(made.motion[:, 7] / made.motion[:, 8], -0.75)
     assert made.vehicle[5] * FREEPLAY_SD_RAD == pytest.approx(freeplay)
 

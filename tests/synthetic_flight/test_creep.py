@@ -15,8 +15,7 @@ from scipy.linalg import expm
 from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError
 from flightmodel.vehicle import CompliantJoint
-from synthetic_flight import _kernels, dynamics, simulate
-from synthetic_flight import _kernels as at
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.ensemble import Start, fly_ensemble
 from synthetic_flight.linear import Slopes, linear_matrix, modes, static_trim
 from synthetic_flight.simulate import Schedule, integrate
@@ -62,14 +61,15 @@ def test_the_kernel_equals_the_readable_form(generic_vehicle, measured):
     one = with_joint(one, quadratic_nmprad2=3e4)
     state = np.append(bent_entry_state([0.004, 0.05, -0.06], [0.1, 0.2, 0.3]), [0.03, -0.02])
     s = simulate.workspace(state[None], simulate.parameter_vector(one)[None])
-    s[at.TRIAL : at.TRIAL + at.STATES], s[at.CREEP + 2 : at.CREEP + 4] = state[:20], state[20:]
+    s[dynamics.TRIAL : dynamics.TRIAL + dynamics.STATES] = state[:20]
+    s[dynamics.CREEP + 2 : dynamics.CREEP + 4] = state[20:]
     tables = simulate.kernel_tables(one, simulate.vacuum_table())
-    _kernels.rates(s, (0,), (0, 0), (), *tables, earth.WGS84, False, False)
+    dynamics.rates(s, (0,), (0, 0), (), *tables, earth.WGS84, False, False)
     moment, creep_rate = two_body.creeping_moment(one, state)
-    in_eci = s[at.R_A : at.R_A + 9].reshape(3, 3) @ s[at.MOMENT : at.MOMENT + 3]
+    in_eci = s[dynamics.R_A : dynamics.R_A + 9].reshape(3, 3) @ s[dynamics.MOMENT : dynamics.MOMENT + 3]
     # central differences of 1e-5 rad: 1e-10 of cubic terms, 1e-16 / 1e-5 of rounding
     measured("moment of a joint that creeps, relative", np.linalg.norm(in_eci - moment) / np.linalg.norm(moment), 1e-8)
-    np.testing.assert_allclose(s[at.CREEP + 4 : at.CREEP + 6], creep_rate, rtol=1e-12)
+    np.testing.assert_allclose(s[dynamics.CREEP + 4 : dynamics.CREEP + 6], creep_rate, rtol=1e-12)
     assert abs(moment @ rotations.rotate(state[6:10], np.array([1.0, 0, 0]))) < 1e-6 * np.linalg.norm(moment)
 
 

@@ -6,8 +6,7 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.vehicle import AeroTerms
-from synthetic_flight import _kernels, dynamics, simulate
-from synthetic_flight import _kernels as at
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.simulate import integrate, state_from_ecef
 from tests.oracles import two_body
 
@@ -37,14 +36,16 @@ def windy():
 
 def kernel_rates(state, vehicle, table, locked=False, added=0.0):
     s = simulate.workspace(state[None], simulate.parameter_vector(vehicle)[None])
-    s[at.ADDED] = added
-    s[at.TRIAL : at.TRIAL + at.STATES] = state
+    s[dynamics.ADDED] = added
+    s[dynamics.TRIAL : dynamics.TRIAL + dynamics.STATES] = state
     terms = (0,) * (vehicle.aero_terms != AeroTerms())
-    _kernels.rates(s, (0,), (), terms, *simulate.kernel_tables(vehicle, table), earth.WGS84, locked, added > 0.0)
+    dynamics.rates(s, (0,), (), terms, *simulate.kernel_tables(vehicle, table), earth.WGS84, locked, added > 0.0)
     # as recorded: forces and moments in ECI
-    vectors = s[at.FORCE : at.FORCE + 9].reshape(3, 3) @ s[at.R_A : at.R_A + 9].reshape(3, 3).T
-    aux = np.concatenate([s[at.ALTITUDE : at.ALTITUDE + 6], vectors.ravel(), s[at.RATE + 14 : at.RATE + 17]])
-    return s[at.RATE : at.RATE + at.STATES], aux
+    vectors = s[dynamics.FORCE : dynamics.FORCE + 9].reshape(3, 3) @ s[dynamics.R_A : dynamics.R_A + 9].reshape(3, 3).T
+    aux = np.concatenate(
+        [s[dynamics.ALTITUDE : dynamics.ALTITUDE + 6], vectors.ravel(), s[dynamics.RATE + 14 : dynamics.RATE + 17]]
+    )
+    return s[dynamics.RATE : dynamics.RATE + dynamics.STATES], aux
 
 
 @pytest.mark.parametrize("quadratic_nmprad2", [0.0, 3e4])
@@ -319,8 +320,8 @@ def test_mirrored_flight_is_the_mirrored_path(vehicle):
 def test_freeplay_corner_is_smooth_and_exact_outside():
     freeplay, corner = 0.01, 0.1
     theta = np.linspace(0.0, 0.03, 30001)
-    d = np.array([_kernels.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in theta])
-    np.testing.assert_allclose(d, dynamics.beyond_freeplay(theta, freeplay, corner), atol=1e-17)
+    d = np.array([dynamics.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in theta])
+    np.testing.assert_allclose(d, dynamics.angle_beyond_freeplay(theta, freeplay, corner), atol=1e-17)
     assert (d[theta <= 0.009] == 0.0).all()
     np.testing.assert_allclose(d[theta >= 0.011], theta[theta >= 0.011] - freeplay, atol=1e-15)
     slope = np.diff(d) / np.diff(theta)

@@ -10,7 +10,7 @@ import pytest
 from flightmodel import earth
 from flightmodel._kernels import FASTMATH
 from flightmodel.checks import ConfigError
-from synthetic_flight import _kernels, simulate
+from synthetic_flight import dynamics, simulate
 from synthetic_flight.ensemble import LANES, Start, fly_ensemble
 from synthetic_flight.scenarios import child_rng
 from synthetic_flight.simulate import Schedule, integrate
@@ -94,7 +94,7 @@ def test_vector_loops_are_in_vector_registers(vehicle, name):
     """A branch or an alias that the compiler cannot see through would undo this in silence."""
     lanes, planet = (0,) * LANES, earth.WGS84
     s = simulate.workspace(np.zeros((LANES, 20)), np.tile(simulate.parameter_vector(vehicle), (LANES, 1)))
-    loop = getattr(_kernels, name)
+    loop = getattr(dynamics, name)
     anew = numba.njit(error_model="numpy", fastmath=FASTMATH)(loop.py_func)
     anew(s, lanes, planet) if loop.py_func.__code__.co_argcount == 3 else anew(s, lanes)
     (assembly,) = anew.inspect_asm().values()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from synthetic_flight import _film_kernels, _kernels, dynamics, film, simulate
+from synthetic_flight import _film_kernels, dynamics, film, instrument_errors, simulate
 from synthetic_flight.simulate import integrate
 from tests.oracles import plain_film, two_body
 
@@ -86,12 +86,12 @@ def test_a_step_is_runge_and_kutta_s_of_fourth_order(generic_vehicle):
 def test_dead_band_is_that_of_the_readable_form():
     freeplay, corner = np.deg2rad(0.4), 0.1
     for theta in np.deg2rad(np.linspace(0.0, 1.0, 41)):
-        got = _kernels.beyond_freeplay(theta, *simulate.freeplay_corner(freeplay, corner))
-        assert got == pytest.approx(float(dynamics.beyond_freeplay(theta, freeplay, corner)), abs=1e-17)
+        got = dynamics.beyond_freeplay(theta, *simulate.freeplay_corner(freeplay, corner))
+        assert got == pytest.approx(float(dynamics.angle_beyond_freeplay(theta, freeplay, corner)), abs=1e-17)
     # the integral from rest to beyond is that of the sharp corner but for what the rounding gives away: half^2 / 12...
     half = corner * freeplay
     grid = np.linspace(freeplay - half, freeplay + half, 4001)
-    area = np.trapezoid([_kernels.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in grid], grid)
+    area = np.trapezoid([dynamics.beyond_freeplay(x, *simulate.freeplay_corner(freeplay, corner)) for x in grid], grid)
     assert area == pytest.approx((2.0 * half) ** 3 / (12.0 * half), rel=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_gauss_markov_noise_is_stationary_row_by_row():
     for row in range(4):
         white, out = np.zeros((4, 1)), np.empty((4, 1))
         white[row] = 1.0
-        _kernels.gauss_markov(keep, white, out)
+        instrument_errors.unit_gauss_markov(keep, white, out)
         weight[:, row] = out[:, 0]
     covariance = weight @ weight.T
     np.testing.assert_allclose(np.diag(covariance), 1.0, rtol=1e-14)
