@@ -14,12 +14,12 @@ from flightmodel.camera import camera_from_mount
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import ShellGeometry, bend, torus_circles, vehicle_meshes
 from flightmodel.vehicle import CameraMount, vehicle_from_toml, vehicle_path
-from synthetic_flight import _film_kernels
 from synthetic_flight.film import (
     Imaging,
     Scene,
     ShellRenderer,
     as_built_camera,
+    cast,
     film,
     record,
     render_video,
@@ -189,7 +189,7 @@ def test_rays_reach_the_far_rim_of_a_shell_of_any_size():
     far = np.array([-station[-1], radius[-1], 0.0]) - eye
     depth = np.empty((1, 1))
     ray, everywhere = (far / np.linalg.norm(far))[None, None], np.ones((1, 1), dtype=bool)
-    _film_kernels.cast(ray, everywhere, np.eye(3), eye, shell_terms(geometry), warp_terms(None), depth)
+    cast(ray, everywhere, np.eye(3), eye, shell_terms(geometry), warp_terms(None), depth)
     # within two rings of the rim: the ray comes in under a flat angle
     assert np.linalg.norm(far) - 4.0 * geometry.torus_minor_radius_m < depth[0, 0] < np.linalg.norm(far)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from synthetic_flight import _film_kernels, dynamics, film, instrument_errors, simulate
+from synthetic_flight import dynamics, film, instrument_errors, simulate
 from synthetic_flight.simulate import integrate
 from tests.oracles import plain_film, two_body
 
@@ -143,9 +143,9 @@ def seen_along(rays, eye, light, shell_and_warp, body, painted, shadows):
     """Depth and radiance (h, w) of a shell in body axes that rays (h, w, 3) meet."""
     depth, shade = np.empty((2, *rays.shape[:2]))
     free, flat = np.full(depth.size, np.nan if shadows else 1.0), rays.reshape(-1, 3)
-    _film_kernels.cast(rays, np.ones(depth.shape, dtype=bool), np.eye(3), eye, *shell_and_warp, depth)
-    _film_kernels.see_sun(flat, depth.ravel(), np.eye(3), eye, light, *shell_and_warp, body, free)
-    _film_kernels.shade_shell(flat, depth.ravel(), free, np.eye(3), eye, light, *shell_and_warp, painted, shade.ravel())
+    film.cast(rays, np.ones(depth.shape, dtype=bool), np.eye(3), eye, *shell_and_warp, depth)
+    film.see_sun(flat, depth.ravel(), np.eye(3), eye, light, *shell_and_warp, body, free)
+    film.shade_shell(flat, depth.ravel(), free, np.eye(3), eye, light, *shell_and_warp, painted, shade.ravel())
     return depth, shade
 
 
@@ -169,7 +169,7 @@ def test_the_film_s_rays_meet_what_plain_ones_do(generic_vehicle, bent):
     np.testing.assert_allclose(depth[met], t.reshape(8, 5)[met], atol=2e-3)
     np.testing.assert_allclose(shade[met], stack.shade(plain, t, light).reshape(8, 5)[met], atol=0.01)
     near, closest = np.empty((2, 40))
-    _film_kernels.closest(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, shell, warp, near, closest)
+    film.closest(rays.reshape(-1, 3), t.astype(float), np.eye(3), eye, shell, warp, near, closest)
     want, far = stack.closest(plain, t)
     np.testing.assert_allclose(near, far, atol=1e-4)
     np.testing.assert_allclose(closest, want, atol=2e-3)
@@ -185,12 +185,12 @@ def test_the_way_to_the_stack_meets_nothing_before_it(generic_vehicle):
     r, clock, out = rng.uniform(0.4, 1.3, 30), rng.uniform(0.0, 2.0 * np.pi, 30), rng.uniform(0.12, 0.3, 30)
     station = stack.s0 + ((r - stack.r0) * stack.cos + out) / stack.sin
     points = np.column_stack([-station, -r * np.cos(clock), r * np.sin(clock)])
-    _film_kernels.sunlit(points, light, film.shell_terms(geometry), film.warp_terms(None), share)
+    film.sunlit(points, light, film.shell_terms(geometry), film.warp_terms(None), share)
     ways = np.linspace(0.0, 4.0, 4001)
     for point, seen in zip(points, share, strict=True):
         along = (point + ways[:, None] * light).T
         gap = stack.gap(plain_film.Rays(along.astype(np.float32), np.zeros(3)), np.float32(1.0))
-        free = np.min(gap[1:] / (_film_kernels.SUN_DIAMETER * ways[1:]))
+        free = np.min(gap[1:] / (film.SUN_DIAMETER * ways[1:]))
         assert seen == pytest.approx(np.clip(free, 0.0, 1.0), abs=0.05)
     assert 0.2 < np.mean(share > 0.5) < 0.8
 
