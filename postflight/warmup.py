@@ -127,14 +127,15 @@ def _balance() -> None:
 
 
 def _spans() -> None:
-    from postflight.reconciliation import _span_kernels as kernels
+    from postflight.reconciliation.forward_model import sense
+    from postflight.reconciliation.normal_equations import add_part
 
     records, number, three = np.zeros((1, 3, 22)), np.zeros(1, dtype=np.int64), np.zeros((1, 3))
     windows, slope = np.empty((2, 1, 1, 6))
     aux, simpson = np.zeros((1, 3, 18)), np.ones(3)
-    kernels.sense(records, aux, number, three, np.ones(1), simpson, 1.0, windows, slope)
+    sense(records, aux, number, three, np.ones(1), simpson, 1.0, windows, slope)
     one = np.zeros((1, 1))
-    kernels.add_part(one, one, one, number, one)
+    add_part(one, one, one, number, one)
 
 
 def _camera() -> None:

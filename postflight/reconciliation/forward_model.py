@@ -27,7 +27,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from flightmodel import _kernels as la
 from flightmodel import earth, rotations
+from flightmodel._kernels import kernel
 from flightmodel.atmosphere import (
     DENSITY_LENGTH_M,
     WIND_LENGTH_M,
@@ -43,7 +45,6 @@ from flightmodel.rotations import skew
 from flightmodel.telemetry import Sounding
 from flightmodel.trajectory import Trajectory, nearest_index, resample
 from flightmodel.vehicle import MassProperties, Uncertainty, Vehicle
-from postflight.reconciliation import _span_kernels
 from postflight.reconstruction import Reconstruction
 from recon.atmosphere import cg_accelerations, windows_are_whole
 from synthetic_flight import simulate
@@ -635,13 +636,44 @@ def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) ->
         )  # fmt: skip
         states, aux = _until_lost(states[:count], aux[:count])
         numbers = np.ascontiguousarray(flights.vehicle[part])  # or the kernel would be compiled for both
-        _span_kernels.sense(states, aux, numbers, arms, masses, simpson, WINDOW_S, windows[part], slope[part])
+        sense(states, aux, numbers, arms, masses, simpson, WINDOW_S, windows[part], slope[part])
         attitudes[part] = states[:, steps.intervals // 2 :: steps.intervals, 6:14]
         ends[part] = states[:, -1]
 
     with ThreadPoolExecutor(available_cores()) as pool:
         list(pool.map(fly, _parts(len(starts))))
     return PredictedSpans(windows, slope, attitudes, _ends(measured, flights, ends))
+
+
+@kernel
+def sense(states, aux, vehicle, arms, masses, simpson, window_s, windows, slope):
+    """Means over windows of rates and specific force, and their rates of change, into (m, windows, 6) each.
+
+    ``states`` (m, records, 20 or 22) and ``aux`` (m, records, 18) as `synthetic_flight.dynamics` has them, of the
+    vehicles numbered ``vehicle`` (m,): accelerometer from the centerbody's c.g. (k, 3), and the centerbody's mass (k,).
+    """
+    intervals = len(simpson) - 1
+    records = np.empty((states.shape[1], 6))
+    for i in range(len(states)):
+        x, y, z = arms[vehicle[i]]
+        mass = masses[vehicle[i]]
+        for k in range(len(records)):
+            s, a = states[i, k], aux[i, k]
+            force = la.back(la.rotation(s[6], s[7], s[8], s[9]), a[6], a[7], a[8])
+            turn = la.cross(a[15], a[16], a[17], x, y, z)
+            speed = la.cross(s[14], s[15], s[16], x, y, z)
+            swing = la.cross(s[14], s[15], s[16], speed[0], speed[1], speed[2])
+            for j in range(3):
+                records[k, j] = s[14 + j]
+                records[k, 3 + j] = force[j] / mass + turn[j] + swing[j]
+        for w in range(windows.shape[1]):
+            first = w * intervals
+            for j in range(6):
+                total = 0.0
+                for k in range(intervals + 1):
+                    total += simpson[k] * records[first + k, j]
+                windows[i, w, j] = total
+                slope[i, w, j] = (records[first + intervals, j] - records[first, j]) / window_s
 
 
 def _parts(flights: int) -> list[slice]:

@@ -24,9 +24,26 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
 
+from flightmodel._kernels import kernel
 from flightmodel.checks import FloatArray
-from postflight.reconciliation import _span_kernels
 from postflight.reconciliation.forward_model import Index
+
+
+@kernel
+def add_part(corner, across, band, place, part):
+    """Add a symmetric part (k, k) at rows and columns ``place`` (k,) of an arrow matrix in its three pieces."""
+    shared = len(corner)
+    for i in range(len(place)):
+        row = place[i]
+        for j in range(len(place)):
+            column = place[j]
+            if row < shared:
+                if column < shared:
+                    corner[row, column] += part[i, j]
+            elif column < shared:
+                across[row - shared, column] += part[i, j]
+            elif row >= column:
+                band[row - column, column - shared] += part[i, j]
 
 
 @dataclass(frozen=True)
@@ -54,7 +71,7 @@ class ArrowMatrix:
 
     def add(self, columns: Index, part: FloatArray) -> None:
         """Add a full symmetric part (k, k) at columns (k,), each at most once."""
-        _span_kernels.add_part(self.corner, self.across, self.band, columns, part)
+        add_part(self.corner, self.across, self.band, columns, part)
 
     def add_pairs(self, row: Index, column: Index, values: FloatArray) -> None:
         """Add elements (k,) of the band and what they mirror, each pair of a row and a column (k,) at most once."""
