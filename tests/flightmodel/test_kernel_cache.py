@@ -102,11 +102,16 @@ def test_no_kernel_calls_another():
     """What is called by kernels is a part, which is one function with its caller: it has one set of bits."""
     decorated, called = {}, set()
     for source in (p for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))):
-        for node in ast.parse(source.read_text()).body:
+        module, body = ".".join(source.relative_to(ROOT).with_suffix("").parts), ast.parse(source.read_text()).body
+        imports = (each for each in body if isinstance(each, ast.ImportFrom))
+        origin = {a.asname or a.name: f"{each.module}.{a.name}" for each in imports for a in each.names}
+        for node in body:
             if isinstance(node, ast.FunctionDef) and {"kernel", "inlined"} & set(map(ast.unparse, node.decorator_list)):
                 assert source.name == "_kernels.py" or HOLDS_KERNELS.search(source.read_bytes()), f"{source}: no hash"
-                decorated[node.name] = ast.unparse(node.decorator_list[0])
-                calls = (each.func for each in ast.walk(node) if isinstance(each, ast.Call))
-                called |= {ast.unparse(function).rsplit(".")[-1] for function in calls}
+                decorated[f"{module}.{node.name}"] = ast.unparse(node.decorator_list[0])
+                for each in (each for each in ast.walk(node) if isinstance(each, ast.Call)):
+                    first, *rest = ast.unparse(each.func).split(".")
+                    called.add(".".join([origin.get(first, f"{module}.{first}"), *rest]))
     assert {"kernel", "inlined"} <= set(decorated.values())
+    assert {"flightmodel._kernels.solved", "recon.propagation.level_transition"} <= called & decorated.keys()
     assert not [name for name in called if decorated.get(name) == "kernel"]
