@@ -30,7 +30,7 @@ from numba.core.registry import CPUDispatcher
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
 # a module that may hold kernels: it imports this one
-HOLDS_KERNELS = re.compile(rb"^from flightmodel(\._kernels import| import ([^\n]*|\([^)]*)\b_kernels\b)", re.MULTILINE)
+HOLDS_KERNELS = re.compile(rb"\nfrom flightmodel(\._kernels import| import ([^\n]*|\([^)]*)\b_kernels\b)")
 REMEDY = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that may be written"
 
 
