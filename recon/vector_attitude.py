@@ -49,7 +49,6 @@ _START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude 
 _TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
 LEAST_INSIDE = 0.90  # of 95 % regions, less what blocks that are not independent scatter
 _MISFIT_ALLOWANCE = 0.15  # motion is no white noise, and blocks are not quite independent
-_LONGEST_GAP_S = 5.0  # without field or Sun, that is bridged; shorter where the vehicle turns by a quarter in less
 
 
 @dataclass(frozen=True)
@@ -223,7 +222,8 @@ def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray) -> tuple[Bool
     step = np.diff(knots_s[solved])
     rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
     rate = float(np.median(rotated / step)) if len(step) else 0.0
-    longest = min(_LONGEST_GAP_S, 0.5 * np.pi / max(rate, 1e-9))
+    # longer ones are not bridged, nor those in which the vehicle turns by more than a quarter
+    longest = min(5.0, 0.5 * np.pi / max(rate, 1e-9))
     keep = np.zeros(len(knots_s), dtype=bool)
     keep[solved[0] : solved[-1] + 1] = True
     found = []
