@@ -176,3 +176,11 @@ def test_every_planted_error_has_its_place():
         [sys.executable, ROOT / "benchmarks" / "mutants.py", "--list"], capture_output=True, text=True, check=False
     )
     assert listed.returncode == 0, listed.stderr
+
+
+@pytest.mark.parametrize("path", [p for p in CODE if "@kernel\n" in p.read_text()], ids=name)
+def test_beside_kernels_functions_state_their_types(path):
+    """The type checker lets kernels go without, and cannot tell them from the rest."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef) and not {"kernel", "inlined"} & set(map(ast.unparse, node.decorator_list)):
+            assert node.returns or path.name.endswith("_kernels.py"), f"{node.name} states no type"
