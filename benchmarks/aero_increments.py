@@ -25,6 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.estimator_coverage import CAMERA_SD, camera_history, columns
 from estimators.evidence import PRESSURE, VEHICLE_INPUTS, moved_vehicle, pressure_input
+from estimators.fusing import fuse_flight
 from estimators.increments import COEFFICIENTS, SHAPE_LENGTH, STATED
 from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
@@ -35,7 +36,6 @@ from flightmodel.statistics import BAND_PERCENTILES, correlation
 from flightmodel.trajectory import resample
 from postflight.flight import Flight
 from postflight.flown_coefficients import increments_of
-from postflight.fusing import fuse_flight
 from postflight.reconstruction import reconstruct
 from recon.settings import Settings
 from synthetic_flight import simulate

@@ -9,8 +9,8 @@ deg in the plane and twice that normal to it.
 import estimator_coverage as dispersed
 import numpy as np
 
+from estimators.fusing import fuse_flight
 from flightmodel.checks import DivergenceError
-from postflight.fusing import fuse_flight
 
 PLANTED_S = (0.0, 0.05, 0.2, -0.05, -0.2)
 STATED_SD_S = 0.3

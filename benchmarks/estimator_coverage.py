@@ -31,6 +31,7 @@ from flightmodel.statistics import correlation
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, HYPOTHESES, MOUNT, OFFSET
 from estimators.evidence import LIGHT_TIME_S
+from estimators.fusing import fuse_flight
 from estimators.loads import FlightLoads
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
@@ -43,7 +44,6 @@ from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fusing import fuse_flight
 from postflight.reconstruction import loads_from_solution
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
@@ -207,9 +207,9 @@ def scored(seed, folder, what):
     for name, camera in {"no video": None, **cameras}.items():
         found = safely(out, lambda c=camera: fuse_flight(pulse, c))
         if found is not None:
-            answers[f"fused, {name}"] = found.fused.history
+            answers[f"fused, {name}"] = found.history
             out.setdefault("disagree", {})[name] = found.agreement.likeliest
-            out["size"] = found.fused.process_size_radps2
+            out["size"] = found.process_size_radps2
     out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items()}
     out["rows"]["angle of attack"] = angle_row(pulse, truth)
     return out
@@ -219,7 +219,7 @@ def of_planted(found, pulse, truth):
     """What the agreement test names, whether it alarms, and the fused error over its sd."""
     if found is None:
         return {"named": None, "red": True}
-    row = row_of(found.fused.history, pulse, truth)
+    row = row_of(found.history, pulse, truth)
     return {
         "named": found.agreement.likeliest, "red": bool(found.agreement.hypotheses), "z": row[0] / row[1], "e": row[0],
     }  # fmt: skip
@@ -335,12 +335,12 @@ def score_packages(folder):
         truth["peak"] = find_peak(table.t_s.to_numpy(), table.dynamic_pressure_pa.to_numpy())[0]
         found = fuse_flight(pulse, None)
         answers = {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
-        rows = {name: row_of(h, pulse, truth) for name, h in {**answers, "fused": found.fused.history}.items()}
+        rows = {name: row_of(h, pulse, truth) for name, h in {**answers, "fused": found.history}.items()}
         words = "; ".join(
             f"{n} {np.rad2deg(r[0]):+.3f} +/- {np.rad2deg(r[1]):.3f} ({r[0] / r[1]:+.2f} sd)" for n, r in rows.items()
         )
         said = ", ".join(found.agreement.likeliest) or "agree"
-        size = found.fused.process_size_radps2
+        size = found.process_size_radps2
         print(
             f"{package.name:14} bent {np.rad2deg(rows['trim'][4]):.2f}: {words}; {said}; process {size:.1f} rad/s2",
             flush=True,

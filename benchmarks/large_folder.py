@@ -3,12 +3,10 @@
 python benchmarks/large_folder.py [FLIGHT, default demo-flight] [--rate HZ, default 48000]
 
 FLIGHT's triads (a folder that `postflight demo` wrote: synthetic) are written anew at HZ into a folder that is removed
-afterwards: between its samples straight lines, with noise added. The run is a process of its own without a cache of
-tables, then again with it.
+afterwards: between its samples straight lines, with noise added. The run is a process of its own.
 """
 
 import argparse
-import os
 import resource
 import shutil
 import subprocess
@@ -48,17 +46,15 @@ def main() -> None:
         folder = Path(root) / "flight"
         size = write_fast(chosen.flight, folder, chosen.rate)
         print(f"{size / 1e9:.2f} GB of telemetry, triads at {chosen.rate:.0f} Hz")
-        for words, cache in (("no cache of tables", "off"), ("writing the cache", "on"), ("from the cache", "on")):
-            begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
-            command = [sys.executable, "-m", "postflight.cli", "run", str(folder)]
-            done = subprocess.run(command, env=os.environ | {"POSTFLIGHT_CACHE": cache}, capture_output=True, text=True)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-            print(
-                f"{words}: {time.perf_counter() - begun:.0f} s by the clock, {spent:.0f} s of processor, at most "
-                f"{after.ru_maxrss / 1024:.0f} MiB so far; exit {done.returncode}; {done.stdout.splitlines()[-1]}",
-                flush=True,
-            )
+        begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        command = [sys.executable, "-m", "postflight.cli", "run", str(folder)]
+        done = subprocess.run(command, capture_output=True, text=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        print(
+            f"{time.perf_counter() - begun:.0f} s by the clock, {spent:.0f} s of processor, at most "
+            f"{after.ru_maxrss / 1024:.0f} MiB; exit {done.returncode}; {done.stdout.splitlines()[-1]}"
+        )
 
 
 if __name__ == "__main__":

@@ -21,12 +21,12 @@ from scipy.stats import chi2
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.estimator_coverage import columns, report, row_of, safely
+from estimators.fusing import fuse_flight
 from estimators.misalignment import estimate_misalignment
 from estimators.trim import estimate_trim
 from flightmodel.events import find_peak
 from flightmodel.trajectory import difference, resample
 from postflight.flight import read_flight
-from postflight.fusing import fuse_flight
 from postflight.reconstruction import reconstruct
 from recon.consistency import GROUPS
 from synthetic_flight.folder import simulate_to_folder
@@ -106,7 +106,7 @@ def scored(name, seed):
     found = safely(out, lambda: fuse_flight(pulse, None))
     answers = {"misalignment": estimate_misalignment(pulse), "trim": estimate_trim(pulse)}
     if found is not None:
-        answers["fused"] = found.fused.history
+        answers["fused"] = found.history
         out["disagree"] = {"no video": found.agreement.likeliest}
     out["rows"] = {method: row_of(history, pulse, known) for method, history in answers.items()}
     return out

@@ -15,8 +15,8 @@ from estimator_coverage import CAMERA_SD, camera_history, flown_aero, fly_missin
 from scipy.stats import norm
 
 from estimators.agreement import CAMERA_MISALIGNED, COEFFICIENTS, MOUNT, OFFSET, fault_hypotheses
+from estimators.fusing import CAMERA_PLANE_SD_RAD, fuse_flight
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
-from postflight.fusing import CAMERA_PLANE_SD_RAD, fuse_flight
 
 DRAWS, FALSE_ALARMS = 200, (0.05, 0.10)
 SIDES = {  # of what `estimator_coverage.planted` plants, in columns of the fault hypotheses
@@ -34,7 +34,7 @@ def separation(seed, folder):
     pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
     use, rng = pulse.through_pulse, np.random.default_rng([seed, 3, 2009])
     camera = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], CAMERA_SD["clean"])
-    input_posterior = fuse_flight(pulse, camera).fused.input_posterior
+    input_posterior = fuse_flight(pulse, camera).input_posterior
     faults = fault_hypotheses(pulse, input_posterior, CAMERA_PLANE_SD_RAD)
     columns = np.hstack([faults[suspect] for suspect in SIDES])
     return columns.T @ (columns - input_posterior.covariance @ columns)

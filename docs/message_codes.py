@@ -16,22 +16,19 @@ OPEN = "..."
 # of a call: which argument is the code, which the words
 CALLS = {
     **dict.fromkeys(("GateError", "ConfigError", "DivergenceError", "TableRangeError"), (1, 0)),
-    **dict.fromkeys(("Fault", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
-    "Finding": (4, 1),
-    "FaultHypothesis": (1, 0),
+    **dict.fromkeys(("Issue", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
     **dict.fromkeys(("line", "_line"), (2, 1)),
     "data_sheet_check": (0, 8),
     "Single": (0, 1),
     "_of_either": (0, 1),
-    "consistency_check": (0, 6),
-    "ConsistencyCheck": (0, 6),
+    **dict.fromkeys(("Check", "Check.of"), (0, 6)),
 }
 # words with a hyphen that are none: encodings, headers of a page, commands and their folders, units, parts of words,
 # effects that `postflight.systematic_differences` names
 NO_CODES = {
     "utf-8", "utf-8-sig", "utf-16", "latin-1", "no-referrer", "no-store", "same-origin", "retry-failed",
     "shell-test", "demo-flight", "study-damping", "study-stiffness", "study-preflight", "study-shell-test",
-    "milli-g", "non-orthogonality", "wind-relative", "time-offset", "track-rotation", "attitude-body",
+    "non-orthogonality", "wind-relative", "time-offset", "track-rotation", "attitude-body",
     "attitude-earth", "inertial-velocity", "other-point",
 }  # fmt: skip
 Known = dict[str, ast.expr]
@@ -131,6 +128,7 @@ def message_codes() -> dict[str, str]:
             by_name[code] = max(by_name.get(code, ""), " ".join(text.split()), key=said)
         for call, known in calls(tree):
             name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+            name = ast.unparse(call.func) if name == "of" else name
             at_code, at_words = CALLS.get(name, (-1, -1))
             spread = [arg for arg in call.args for arg in [arg] * (1 + isinstance(arg, ast.Starred))]  # of two: a span
             given = dict(enumerate(spread)) | {word.arg: word.value for word in call.keywords}

@@ -11,9 +11,6 @@ import numpy as np
 from estimators._sight_kernels import pixel_of
 from flightmodel._kernels import inlined, kernel
 
-_TURNS_BESIDE = 2  # on either side of the middle of a square of turns, all of which are left out at once
-_ROUNDING_PX = 1e-9
-
 
 @inlined
 def _grey_inside(image, u, v):
@@ -22,77 +19,6 @@ def _grey_inside(image, u, v):
     a, b = u - j, v - i
     upper = (1.0 - a) * image[i, j] + a * image[i, j + 1]
     return (1.0 - b) * upper + b * ((1.0 - a) * image[i + 1, j] + a * image[i + 1, j + 1])
-
-
-@inlined
-def _spare(image, count):
-    """Room for so many samples: their pixels' places in the flat picture, shares beyond them, and four levels."""
-    at, levels = np.empty(count, dtype=np.int32), np.empty((4, count), dtype=image.dtype)
-    return at, np.empty(count), np.empty(count), levels
-
-
-@inlined
-def _places_along(u, v, du, dv, first, step, corner_u, corner_v, width, at, right, below):
-    """Places of samples (n,), ``first + k step`` along (du, dv) from (u, v), in the picture from ``corner`` on."""
-    for k in range(len(at)):
-        # of 32 bits: others cannot be made from places in vector registers
-        along = first + np.int32(k) * step
-        x, y = u + along * du - corner_u, v + along * dv - corner_v
-        j, i = np.int32(x), np.int32(y)
-        at[k] = i * np.int32(width) + j
-        right[k], below[k] = x - j, y - i
-
-
-@inlined
-def _levels_there(flat, width, count, spare, grey):
-    """As `_grey_inside`, of so many samples; the loads by themselves, so that all else runs in vector registers."""
-    at, right, below, four = spare
-    one, next_row = np.uint64(1), np.uint64(width)
-    for k in range(count):
-        here = np.uint64(at[k])
-        four[0, k], four[1, k] = flat[here], flat[here + one]
-        four[2, k], four[3, k] = flat[here + next_row], flat[here + next_row + one]
-    for k in range(count):
-        a, b = right[k], below[k]
-        upper = (1.0 - a) * four[0, k] + a * four[1, k]
-        grey[k] = (1.0 - b) * upper + b * ((1.0 - a) * four[2, k] + a * four[3, k])
-
-
-@inlined
-def _levels_along(flat, width, line, first, step, corner, count, spare, grey):
-    """As `_grey_inside`, of so many samples of a line, from (u, v) along (du, dv), in a piece of the picture."""
-    at, right, below, _ = spare
-    u, v, du, dv = line
-    _places_along(
-        u, v, du, dv, first, step, corner[0], corner[1], width, at[:count], right[:count], below[:count]
-    )  # fmt: skip
-    _levels_there(flat, width, count, spare, grey)
-
-
-@inlined
-def _span_within(at, along, low, high, first, last):
-    """Part of a line from ``first`` to ``last`` whose coordinate, ``at`` and so much a pixel along, lies within."""
-    if along == 0.0:
-        return (first, last) if low < at < high else (last, first)
-    one, two = (low - at) / along, (high - at) / along
-    return max(first, min(one, two)), min(last, max(one, two))
-
-
-@inlined
-def _inner_samples(line, first, step, count, image, corner, size):
-    """First and one beyond the last sample of a line that surely lie in the picture, and in the piece of it.
-
-    ``corner`` is the upper left pixel of the piece, ``size`` the picture's.
-    """
-    u, v, du, dv = line
-    h, w = image.shape
-    high_u, high_v = min(corner[0] + w - 1.000001, size[0] - 1.0), min(corner[1] + h - 1.000001, size[1] - 1.0)
-    begin, end = _span_within(u, du, max(corner[0], 0.0), high_u, first, first + (count - 1) * step)
-    begin, end = _span_within(v, dv, max(corner[1], 0.0), high_v, begin, end)
-    # a sample at a border is left to the comparison with it
-    low = int((begin - first) / step) + 2 if begin > first else 0
-    high = int((end - first) / step) - 1 if end < first + (count - 1) * step else count
-    return min(max(low, 0), count), min(max(high, low, 0), count)
 
 
 @inlined
@@ -136,124 +62,6 @@ def median(values, count):
     return 0.5 * (below + values[half])
 
 
-@kernel
-def middle_of_sizes(values, bins):
-    """Median of the sizes of numbers (n, m) without NaN, by a count in ``bins`` and a selection in the middle's own.
-
-    Of a selection alone the processor guesses half of the comparisons wrongly.
-    """
-    n, m = values.shape
-    most = 0.0
-    for i in range(n):
-        for j in range(m):
-            most = max(most, abs(values[i, j]))
-    if most == 0.0:
-        return 0.0
-    count, per = np.zeros(bins, dtype=np.int64), (bins - 1) / most
-    for i in range(n):
-        for j in range(m):
-            count[int(abs(values[i, j]) * per)] += 1
-    # both middle ones of an even number
-    second, below = n * m // 2, 0
-    first = second - 1 + n * m % 2
-    low = 0
-    while below + count[low] <= first:
-        below += count[low]
-        low += 1
-    high, upto = low, below + count[low]
-    while upto <= second:
-        high += 1
-        upto += count[high]
-    few, held = np.empty(upto - below), 0
-    for i in range(n):
-        for j in range(m):
-            size = abs(values[i, j])
-            if low <= int(size * per) <= high:
-                few[held] = size
-                held += 1
-    _select(few, held, second - below)
-    upper = few[second - below]
-    lower = upper if first == second else few[0]
-    for i in range(1, second - below if first < second else 0):
-        lower = max(lower, few[i])
-    return 0.5 * (lower + upper)
-
-
-@kernel
-def grey_levels(image):
-    """Grey levels that 5 and 95 % of the pixels do not exceed, and the share at full scale (254 and more).
-
-    Of every fourth column, and of every eighth row; the share of every fourth.
-    """
-    count, full, seen = np.zeros(256, dtype=np.int64), 0, 0
-    for i in range(0, image.shape[0], 4):
-        for j in range(0, image.shape[1], 4):
-            full += image[i, j] >= 254
-            seen += 1
-            if i % 8 == 0:
-                count[image[i, j]] += 1
-    low, high, below, total = -1, -1, 0, count.sum()
-    for level in range(256):
-        below += count[level]
-        if low < 0 and below > 0.05 * total:
-            low = level
-        if high < 0 and below > 0.95 * total:
-            high = level
-    return low, high, full / seen
-
-
-@kernel
-def row_differences(image, tall, wide, step, most, one, two, steps):
-    """How rows differ, of every ``step``-th column.
-
-    ``one``, ``two``: mean square difference of rows next to each other, and of every other row, in blocks of ``tall`` x
-    ``wide`` px. ``steps`` (h - 1,): mean difference of every row from the next, at most ``most`` a pixel.
-    """
-    h = image.shape[0]
-    across = wide // step
-    columns, used = (image.shape[1] + step - 1) // step, one.shape[1] * across
-    # whole numbers, sums below 2^24: exact, and half as wide as the compiler's integers
-    line, limit = np.zeros((3, columns), dtype=np.float32), np.float32(most)
-    near, far = np.zeros(columns, dtype=np.float32), np.zeros(columns, dtype=np.float32)
-    for i in range(h):
-        new, row = line[i % 3], image[i, ::step]
-        for j in range(columns):
-            new[j] = row[j]
-        if i > 0:
-            total, before = np.float32(0.0), line[(i - 1) % 3]
-            for j in range(columns):
-                total += min(abs(new[j] - before[j]), limit)
-            steps[i - 1] = np.float64(total) / columns
-        if i > 1 and (i - 2) // tall < one.shape[0]:
-            first, second = line[(i - 2) % 3], line[(i - 1) % 3]
-            for j in range(used):
-                near[j] += (first[j] - second[j]) * (first[j] - second[j])
-                far[j] += (first[j] - new[j]) * (first[j] - new[j])
-            if (i - 1) % tall == 0:
-                block = (i - 2) // tall
-                for c in range(one.shape[1]):
-                    of_near, of_far = np.float64(0.0), np.float64(0.0)
-                    for j in range(c * across, (c + 1) * across):
-                        of_near += near[j]
-                        of_far += far[j]
-                    one[block, c], two[block, c] = of_near / (tall * across), of_far / (tall * across)
-                near[:] = 0
-                far[:] = 0
-
-
-@kernel
-def breaks(steps, beside, over, found):
-    """Mark steps (n,) of more than ``over`` over twice the median of those ``beside``, of mirrored ends."""
-    n = len(steps)
-    for i in range(n):
-        most, below = 0.5 * (steps[i] - over), 0
-        if most > 0.0:
-            for j in range(i - beside, i + beside + 1):
-                k = abs(j)
-                below += steps[2 * (n - 1) - k if k > n - 1 else k] < most
-        found[i] = below > beside
-
-
 @inlined
 def _band_along(origin, inward, outer, inner, size):
     """As `band_of_lines`, along one axis."""
@@ -281,15 +89,8 @@ def band_of_lines(origin, inward, outer, inner, size):
 def sample_lines(image, origin, inward, first, step, corner, size, grey, inside):
     """Grey levels ``(n, m)`` along lines, of a piece of the picture whose upper left pixel is ``corner``."""
     n, m = grey.shape
-    flat, width, spare = image.ravel(), image.shape[1], _spare(image, m)
     for i in range(n):
-        line = origin[i, 0], origin[i, 1], inward[i, 0], inward[i, 1]
-        begin, end = _inner_samples(line, first, step, m, image, corner, size)
-        for k in range(begin, end):
-            inside[i, k] = True
-        _levels_along(flat, width, line, first + begin * step, step, corner, end - begin, spare, grey[i, begin:])
-        for k in range(m - end + begin):
-            k = k if k < begin else k + end - begin
+        for k in range(m):
             along = first + k * step
             u, v = origin[i, 0] + along * inward[i, 0], origin[i, 1] + along * inward[i, 1]
             inside[i, k] = u >= 0.0 and v >= 0.0 and u <= size[0] - 1.0 and v <= size[1] - 1.0
@@ -481,9 +282,8 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
     is. ``sd`` is infinite where no dip stands out of the noise, or where it is cut off by the window.
     """
     m = 2 * reach + 1
-    dip, grey, spare = np.empty(m), np.empty(3 * m), _spare(image, 3 * m)
+    dip, grey = np.empty(m), np.empty(3 * m)
     h, w = image.shape
-    flat, (at, share_u, share_v, _) = image.ravel(), spare
     for i in range(len(origin)):
         sd[i] = np.inf
         du, dv = across[i]
@@ -494,11 +294,9 @@ def dark_centres(image, origin, across, reach, half_widths, signs, noise, offset
                 sd[i] = np.inf
                 break
             for c in range(3):
-                part, off_u, off_v = slice(c * m, c * m + m), (c - 1) * dv, (1 - c) * du
-                _places_along(
-                    u0, v0, du, dv, -reach, 1.0, off_u, off_v, w, at[part], share_u[part], share_v[part]
-                )  # fmt: skip
-            _levels_there(flat, w, 3 * m, spare, grey)
+                for k in range(m):
+                    u, v = u0 + (k - reach) * du - (c - 1) * dv, v0 + (k - reach) * dv - (1 - c) * du
+                    grey[c * m + k] = _grey_inside(image, u, v)
             for k in range(m):
                 dip[k] = (grey[m + k] + (grey[k] + grey[2 * m + k])) / 3.0
             left, right = 0.5 * (dip[0] + dip[1]), 0.5 * (dip[m - 1] + dip[m - 2])
@@ -616,119 +414,3 @@ def coherent(line, residual, beside, within, found):
         for j in range(max(i - beside, 0), min(i + beside + 1, n)):
             alike += abs(line[j] - line[i]) <= beside and abs(residual[j] - residual[i]) < within
         found[i] = alike > beside
-
-
-@kernel
-def rises_over_pixel(grey, near, rise, first):
-    """Rises (n, m - 2) over two samples along lines (n, m), and the steepest (n,) within ``near`` of their middles.
-
-    All of a line are positive in the steepest one's direction.
-    """
-    n, m = rise.shape
-    middle = m // 2
-    for i in range(n):
-        first[i] = 0.0
-        for j in range(m):
-            rise[i, j] = grey[i, j + 2] - grey[i, j]
-            if abs(j - middle) <= near and abs(rise[i, j]) > abs(first[i]):
-                first[i] = rise[i, j]
-        if first[i] < 0.0:
-            first[i] = -first[i]
-            for j in range(m):
-                rise[i, j] = -rise[i, j]
-
-
-@kernel
-def tops(rise, least, steps):
-    """Mark the samples (n, m) of lines that rise more than ``least`` (n,) there, and no less than beside them."""
-    n, m = rise.shape
-    for i in range(n):
-        steps[i, 0], steps[i, m - 1] = False, False
-        for j in range(1, m - 1):
-            value = rise[i, j]
-            steps[i, j] = value > least[i] and value >= rise[i, j - 1] and value >= rise[i, j + 1]
-
-
-@inlined
-def _may_agree(hits, turns, able, y, z, limits, best):
-    """Whether one of the turns about (y, z) may do better; the last ``able`` points may agree with some turn.
-
-    ``hits`` (n, k + 1): how many samples before each one agree; ``turns`` (n, 3): derivatives by a turn, and the most,
-    px, that the turns about the middle one move a point by beyond it.
-    """
-    nearest, farthest, spacing, least, low = limits
-    n, k = len(turns), hits.shape[1] - 1
-    middle = k // 2 + 0.5
-    may, must = 0, 0
-    for i in range(n):
-        if i % 16 == 0 and may + min(able, n - i) < best * max(must, least):
-            return False
-        off, more = turns[i, 0] * y + turns[i, 1] * z, turns[i, 2]
-        size = abs(off)
-        must += (size - more >= nearest) & (size + more <= farthest)
-        if n - i <= able:
-            first = min(max(int(middle + (off - more) / spacing), 0), k)
-            last = min(max(int(middle + (off + more) / spacing), -1), k - 1)
-            possible = (size + more >= nearest) & (size - more <= farthest)
-            may += possible & (hits[i, last + 1] > hits[i, first])
-    return may >= best * max(must, least) if best > low else may > best * max(must, least)
-
-
-@kernel
-def share_of_second_edge(steps, by_turn, limits):
-    """Largest share of points (n,) with a step where a turn would put them, and the turn's size, rad; or ``low`` and 0.
-
-    ``steps`` (n, k): where on the line across each point, which lies in the middle, a step is found; within a pixel
-    counts. ``limits``: nearest and farthest that a turn puts a point, px; samples' spacing, px; least points that it
-    puts between; share ``low`` that asks for more. Turns are tried a pixel apart for the point that moves most, and of
-    equal ones the first is taken; squares of them that cannot do better are left out.
-    """
-    nearest, farthest, spacing, least, low = limits
-    n, width = steps.shape
-    middle, beside = width // 2, round(1.0 / spacing)
-    most = 0.0
-    for i in range(n):
-        most = max(most, math.hypot(by_turn[i, 0], by_turn[i, 1]))
-    best, size = low, 0.0
-    if n < least or most == 0.0:
-        return best, size
-    spread = np.zeros(steps.shape, dtype=np.bool_)
-    hits, turns = np.zeros((n, width + 1), dtype=np.int16), np.empty((n, 3))
-    # lines without a step far enough from the first agree with no turn: they come first
-    near, able = int(nearest / spacing) - beside - 1, 0
-    for i in range(n):
-        has = False
-        for j in range(width):
-            has = has or (steps[i, j] and abs(j - middle) > near)
-        able += has
-        row = n - able if has else i - able
-        turns[row, 0], turns[row, 1] = by_turn[i, 0], by_turn[i, 1]
-        turns[row, 2] = _TURNS_BESIDE * (abs(by_turn[i, 0]) + abs(by_turn[i, 1])) / most + _ROUNDING_PX
-        for j in range(width):
-            if steps[i, j]:
-                spread[row, max(j - beside, 0) : j + beside + 1] = True
-        for j in range(width):
-            hits[row, j + 1] = hits[row, j] + spread[row, j]
-    reach, first = int(farthest), (0, 0)
-    for middle_a in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
-        for middle_b in range(_TURNS_BESIDE - reach, reach + _TURNS_BESIDE + 1, 2 * _TURNS_BESIDE + 1):
-            if not _may_agree(hits, turns, able, middle_a / most, middle_b / most, limits, best):
-                continue
-            for a in range(middle_a - _TURNS_BESIDE, min(middle_a + _TURNS_BESIDE, reach) + 1):
-                for b in range(middle_b - _TURNS_BESIDE, min(middle_b + _TURNS_BESIDE, reach) + 1):
-                    y, z = a / most, b / most
-                    moved, found = 0, 0
-                    for i in range(n):
-                        left = min(able, n - i)
-                        if i % 16 == 0 and found + left < best * (moved + left):
-                            break  # were all the others to agree, it would not be the largest
-                        off = turns[i, 0] * y + turns[i, 1] * z
-                        if nearest <= abs(off) <= farthest:
-                            moved += 1
-                            found += spread[i, int(middle + 0.5 + off / spacing)]
-                    if moved < least or not found > low * moved:
-                        continue
-                    share = found / moved
-                    if share > best or (share == best and (a, b) < first):
-                        best, size, first = share, math.hypot(y, z), (a, b)
-    return best, size

@@ -103,23 +103,25 @@ _ALSO = np.log(100.0)  # odds below which the next hypothesis is named too: odds
 
 @dataclass(frozen=True)
 class Pair:
-    """Test of two methods.
+    """Test of two methods or cameras, or of one camera against all others.
 
     Parameters
     ----------
-    methods : (str, str)
+    methods : tuple of str
     chi_square : float
         Of their differences.
     degrees : int
         Degrees of freedom.
-    p_value : float
-        Probability of a larger chi-square.
     """
 
-    methods: tuple[str, str]
+    methods: tuple[str, ...]
     chi_square: float
     degrees: int
-    p_value: float
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi-square."""
+        return float(chdtrc(self.degrees, self.chi_square))
 
     @property
     def passed(self) -> bool:
@@ -158,7 +160,7 @@ class Agreement:
         """One sentence; ``cause``: what is found wrong by itself, before which no input is suspected."""
         if not self.pairs:
             return "only one method has an answer: no independent measurement to compare it with"
-        failed = [f"{a} and {b}" for a, b in (p.methods for p in self.pairs if not p.passed)]
+        failed = [" and ".join(p.methods) for p in self.pairs if not p.passed]
         if not failed and not self.hypotheses:
             return "the methods agree within their stated uncertainties"
         named = " or the ".join(self.likeliest)
@@ -227,7 +229,7 @@ def agreement(
         d, cov = _difference(a, b, deflection)
         if len(d):
             square = float(d @ cho_solve(cho_factor(cov), d))
-            pairs.append(Pair((a.method, b.method), square, len(d), float(chdtrc(len(d), square))))
+            pairs.append(Pair((a.method, b.method), square, len(d)))
     if input_posterior is None or not pairs:
         return Agreement(tuple(pairs), {}, np.empty(0))
     gains = {}

@@ -15,13 +15,12 @@ in common, which makes ``z`` smaller than it might be; the frames err together, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import ndtri
 
 from estimators.agreement import CONFIDENCE
 from estimators.camera import FilmFit, polar
+from flightmodel.checks import Check
 from flightmodel.deflection import lv_clock
 
 _LOADED = 0.5  # of the largest deflection: below, a wrong plane hides in the error bar
@@ -29,48 +28,8 @@ _MISREAD = 10  # one frame of so many may be
 LIMIT_SD = float(ndtri(CONFIDENCE))
 
 
-@dataclass(frozen=True)
-class PlaneTest:
-    """What a film says of the plane that is assumed.
-
-    Parameters
-    ----------
-    theta_rad, plane_lv_rad : float
-        Mean deflection of the loaded frames with the plane estimated.
-    in_plane_rad, assumed_lv_rad : float
-        Their mean answer in the assumed plane.
-    over_sd : float
-        What that leaves out over its sd, of the loaded frames the worst (one of ten left out).
-    """
-
-    theta_rad: float
-    plane_lv_rad: float
-    in_plane_rad: float
-    assumed_lv_rad: float
-    over_sd: float
-
-    @property
-    def passed(self) -> bool:
-        """Whether the assumed plane explains the frames."""
-        return self.over_sd <= LIMIT_SD
-
-    @property
-    def remark(self) -> str:
-        """What was found, and where it fails what to do."""
-        size, plane, inside, assumed = np.rad2deg(
-            [self.theta_rad, self.plane_lv_rad, self.in_plane_rad, self.assumed_lv_rad]
-        )
-        found = (
-            f"camera: in the assumed plane ({assumed:.0f} deg LV) the shell is deflected by {inside:.2f} deg, with the "
-            f"plane left open by {size:.2f} deg towards {plane:.0f} deg LV (means of the frames with most)"
-        )
-        if self.passed:
-            return found
-        return f"{found}, {self.over_sd:.1f} sd apart: leave the plane open (no --plane, no camera_plane_lv_deg)"
-
-
-def plane_test(film: FilmFit) -> PlaneTest | None:
-    """Whether a film bears out its assumed plane; None where none is assumed, or no frame has an answer."""
+def plane_check(film: FilmFit) -> Check | None:
+    """Check that a film bears out its assumed plane; None where none is assumed, or no frame has an answer."""
     fits = [fit.with_open_plane for fit in film.fits]
     rows = np.array([k for k, fit in enumerate(fits) if fit is not None and not film.fits[k].refused], dtype=int)
     if film.plane_lv_rad is None or not len(rows):
@@ -86,4 +45,12 @@ def plane_test(film: FilmFit) -> PlaneTest | None:
     left_out = len(rows) // _MISREAD
     over_sd = max(float(np.sort(apart)[::-1][left_out]), float(np.sort(-inside / own_sd)[left_out]), 0.0)
     mean = np.mean(size[:, None] * np.column_stack([-np.cos(clock), np.sin(clock)]), axis=0)
-    return PlaneTest(float(size.mean()), float(lv_clock(mean)), float(inside.mean()), film.plane_lv_rad, over_sd)
+    theta, plane, within, assumed = np.rad2deg([size.mean(), lv_clock(mean), inside.mean(), film.plane_lv_rad])
+    words = (
+        f"camera: in the assumed plane ({assumed:.0f} deg LV) the shell is deflected by {within:.2f} deg, with the "
+        f"plane left open by {theta:.2f} deg towards {plane:.0f} deg LV (means of the frames with most)"
+    )
+    passed, name = over_sd <= LIMIT_SD, "deflection that the assumed plane leaves out, over its sd"
+    if not passed:
+        words += f", {over_sd:.1f} sd apart: leave the plane open (no --plane, no camera_plane_lv_deg)"
+    return Check("camera-plane", name, over_sd, 0.0, LIMIT_SD, passed, words, "camera")

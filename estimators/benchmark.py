@@ -54,7 +54,6 @@ from scipy.special import softmax
 from estimators.body_edge import body_edge
 from estimators.camera_fit import USUAL_SHARE, Image, OrientedCamera
 from estimators.edge import (
-    NO_FAULT,
     HorizonLine,
     ScanLines,
     breaks_across,
@@ -73,7 +72,7 @@ from estimators.texture import BESIDE_PAINT_PX, PaintedTexture, texture_of
 from estimators.virtual_camera import DEFLECTION, FLATTENING, VirtualCamera
 from flightmodel import rotations
 from flightmodel.camera import Camera, camera_from_mount
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, GateError, Issue
 from flightmodel.deflection import lv_clock, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry
 from flightmodel.statistics import NORMAL_MAD, mixture_moments, paired_covariance, symmetric_root
@@ -204,21 +203,21 @@ def orient_camera(
 
 def _by_stated_features(
     nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd
-) -> tuple[OrientedCamera | None, Fault]:
+) -> tuple[OrientedCamera | None, Issue]:
     """Camera oriented by the features that the vehicle file states, or why the frame does not bear them out."""
     try:
         oriented = _oriented(nominal, benchmark, prior, apriori, visible_features)
     except GateError as fault:
         if _NOT_SQUARE in fault.codes:
             raise
-        return None, Fault(f"the stated features do not orient the camera ({fault})", fault.codes[0])
+        return None, Issue(f"the stated features do not orient the camera ({fault})", fault.codes[0])
     if oriented.support > LEAST_FEATURES_SHARE and oriented.residual_rms_px < USUAL_RMS_PX:
         return oriented, NO_FAULT
     words = (
         f"the benchmark frame shows {100.0 * oriented.support:.0f} % of the features that the vehicle file states, "
         f"with an rms of {oriented.residual_rms_px:.1f} px"
     )
-    return None, Fault(words, "features-not-found")
+    return None, Issue(words, "features-not-found")
 
 
 def _with_texture_behind(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCamera:
@@ -640,7 +639,7 @@ def benchmark_deflection(frames: RelativeDeflections, loads: FlightLoads, prior_
     rows = np.flatnonzero(known)
     rows = rows[:: max(1, -(-len(rows) // MOST_FRAMES))]
     if len(rows) < LEAST_FRAMES:
-        raise GateError(f"{len(rows)} frames with sensor data where {LEAST_FRAMES} are needed", code="too-few-frames")
+        raise GateError(f"{len(rows)} frames with sensor data where {LEAST_FRAMES} are needed", code="too-few-data")
     times = np.append(frames.time_s[rows], frames.benchmark_s)
     whole = joint_moment(loads)
     moment = whole.at(loads.time_s, times)

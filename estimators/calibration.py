@@ -33,7 +33,7 @@ from scipy.special import ndtr, stdtrit
 
 from flightmodel import tables
 from flightmodel.camera import Lens
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.statistics import jackknife_variance
 
 COLUMNS = ("image", "X_m", "Y_m", "u_px", "v_px")
@@ -101,14 +101,14 @@ def read_corners(path: Path) -> pd.DataFrame:
     if missing:
         found = ", ".join(table.columns)
         hints = [f"no column '{c}'{nearest_name(c, list(table.columns))}; found {found}" for c in missing]
-        raise GateError([f"{label}: {path}: line 1: {hint}" for hint in hints], code="table-column-missing")
-    faults: list[str] = []
+        raise GateError([f"{label}: {path}: line 1: {hint}" for hint in hints], code="column-missing")
+    faults: list[Issue] = []
     values = {c: tables.numbers(table, c, path, label, faults) for c in COLUMNS[1:]}
     for c, column in values.items():
         if not faults and np.isnan(column).any():
             line = tables.line_of(table, int(np.argmax(np.isnan(column))))
             what = f"{label}: {path}: line {line}, column '{c}': no number; remove the line"
-            faults.append(Fault(what, "not-a-number"))
+            faults.append(Issue(what, "not-a-number"))
     if faults:
         raise GateError(faults)
     return pd.DataFrame({"image": table["image"].str.strip().to_numpy(), **values})
@@ -154,7 +154,7 @@ def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens =
         raise GateError(
             f"calibration: OpenCV found no solution ({failed.err}); check that the board's columns are in metres, that "
             "corners are in the same order in every picture, and that the lens is the right kind",
-            code="calibration-failed",
+            code="not-converged",
         ) from failed
     distortion = np.asarray(found, dtype=float).ravel()
     residual, jacobian = _reprojected(boards, pixels, matrix, distortion, rotations, shifts, lens)
@@ -197,44 +197,42 @@ def _check_condition(jacobian: FloatArray) -> None:
             f"calibration: ill-conditioned: condition number above {_LARGEST_CONDITION:.0e}; take pictures in which "
             "the board is tilted to several sides and reaches the edges; check that each picture's corners lie "
             "where that picture has them",
-            code="calibration-ill-conditioned",
+            code="not-observable",
         )
 
 
-def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[Fault]:
+def _faults(corners: pd.DataFrame, size_px: tuple[int, int]) -> list[Issue]:
     """Faults of a table of corners."""
     missing = [c for c in COLUMNS if c not in corners.columns]
     if missing:
         listed = list(corners.columns)
-        return [
-            Fault(f"calibration: no column '{c}'{nearest_name(c, listed)}", "table-column-missing") for c in missing
-        ]
+        return [Issue(f"calibration: no column '{c}'{nearest_name(c, listed)}", "column-missing") for c in missing]
     out = []
     numbers = corners[list(COLUMNS[1:])].apply(pd.to_numeric, errors="coerce")
     bad = np.flatnonzero(~np.isfinite(numbers.to_numpy(dtype=float)).all(axis=1))
     if len(bad):
-        return [Fault(f"calibration: line {bad[0] + 2}: not a number ({len(bad)} such lines)", "not-a-number")]
+        return [Issue(f"calibration: line {bad[0] + 2}: not a number ({len(bad)} such lines)", "not-a-number")]
     outside = (numbers["u_px"] < -0.5) | (numbers["v_px"] < -0.5)
     outside |= (numbers["u_px"] > size_px[0] - 0.5) | (numbers["v_px"] > size_px[1] - 0.5)
     if outside.any():
         row = int(np.argmax(outside.to_numpy()))
         where = f"({numbers['u_px'].iloc[row]:g}, {numbers['v_px'].iloc[row]:g}) px"
         what = f"corner at {where} lies outside a picture of {size_px[0]} x {size_px[1]}; check the size"
-        out.append(Fault(f"calibration: line {row + 2}: {what}", "corner-outside-picture"))
+        out.append(Issue(f"calibration: line {row + 2}: {what}", "value-range"))
     far = numbers[["X_m", "Y_m"]].abs() > _LARGEST_BOARD_M
     if far.any(axis=None):
         row = int(np.argmax(far.any(axis=1).to_numpy()))
         where = f"({numbers['X_m'].iloc[row]:g}, {numbers['Y_m'].iloc[row]:g}) m"
         what = f"corner at {where} of the board; metres, below {_LARGEST_BOARD_M:g}"
-        out.append(Fault(f"calibration: line {row + 2}: {what}", "corner-off-board"))
+        out.append(Issue(f"calibration: line {row + 2}: {what}", "value-range"))
     counts = corners.groupby("image").size()
     if len(counts) < LEAST_PICTURES:
         what = f"calibration: {len(counts)} pictures; at least {LEAST_PICTURES}, better 20, are needed"
-        out.append(Fault(what, "too-few-pictures"))
+        out.append(Issue(what, "too-few-data"))
     few = counts[counts < _LEAST_CORNERS]
     if len(few):
         what = f"calibration: image {few.index[0]} has {few.iloc[0]} corners; at least {_LEAST_CORNERS} are needed"
-        out.append(Fault(what, "too-few-corners"))
+        out.append(Issue(what, "too-few-data"))
     return out
 
 

@@ -27,13 +27,21 @@ import numpy as np
 
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections, orient_camera
 from estimators.camera_fit import Image, OrientedCamera
-from estimators.edge import NO_FAULT, no_horizon
+from estimators.edge import no_horizon
 from estimators.frame_edits import edited
 from estimators.frame_solution import AprioriSd, FrameFit, refused_fit
-from estimators.surface_noise import mixed_with
 from estimators.texture import TrackedTexture
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, Progress, check_finite, check_increasing
+from flightmodel.checks import (
+    NO_FAULT,
+    BoolArray,
+    FloatArray,
+    GateError,
+    Issue,
+    Progress,
+    check_finite,
+    check_increasing,
+)
 from flightmodel.deflection import (
     DeflectionHistory,
     history_from_lateral,
@@ -50,20 +58,17 @@ if TYPE_CHECKING:
 
 _MOST = 0.5  # of the answered frames
 _DOUBTFUL = 2  # of the four frames around: one alone is a spoilt frame, not a spoilt film
-_OF_PICTURE = ("frame-dark", "frame-saturated", "frame-size", "frame-undecodable", "frame-not-grey", "frame-frozen")
+_OF_PICTURE = ("frame-exposure", "frame-size", "frame-undecodable", "frame-frozen")
 _NOT_THE_SHELL = (
-    "camera-turned", "picture-warped", "picture-doubled", "edge-not-shell", "features-contradict-edge",
-    "halves-differ", "shell-little-seen", "features-lost", "picture-mixed",
+    "camera-turned", "picture-warped", "edge-not-shell", "features-contradict-edge", "halves-differ",
+    "shell-little-seen", "features-lost",
 )  # fmt: skip
 # share of the benchmark frame's patches: of plain cloth 0.2 agree in the best frame of seven films, of paint 0.3 to 0.5
 # (over so many frames that they are not the benchmark's neighbours alone)
 _PAINTED, _LEAST_PAINTED = 0.25, 3
-# frames with two edges, and of all: of thirty films of two pictures mixed 17 % and more, but for two that are refused
-# otherwise; of eighty sound ones 7 % at the most, one at 0.5 rpm 18 %, where the Earth's limb lies along the rim
-_LEAST_MIXED, _MIXED = 2, 0.15
 _LEVEL_FRAMES = 9  # of which more than half would have to be wrong
 _EDGE_FOR_PLANE = 0.5  # of the edge in the benchmark frame: a frame needs half as much, found in both
-_FROZEN = Fault("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
+_FROZEN = Issue("the same picture as the frame before, pixel by pixel: frozen, or copied", "frame-frozen")
 _SWAP = np.array([[0.0, 1.0], [-1.0, 0.0]])  # from a rotation about body y and z to the lateral vector
 
 
@@ -112,7 +117,7 @@ class FilmFit:
             Where a plane was assumed: only one component was read.
         """
         if self.plane_lv_rad is not None:
-            raise GateError("in an assumed plane only one component of the deflection is read", code="plane-assumed")
+            raise GateError("in an assumed plane only one component of the deflection is read", code="keys-conflict")
         rest = np.array([fit.per_benchmark for fit in self.fits])
         prior = self.oriented.apriori.benchmark_rad**2 * rest @ rest.transpose(0, 2, 1)
         covariance = np.array([fit.covariance for fit in self.fits]) - prior
@@ -302,7 +307,7 @@ def read_film(
     if benchmark is None:
         frames = list(frames)
         if len(frames) != len(times):
-            raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="frame-count")
+            raise GateError(f"{len(times)} frame times for {len(frames)} frames", code="argument-value")
         benchmark = _read_frame(frames[nearest])
     benchmark_frame = edited(benchmark, edits, float(times[nearest]), fixed)
     oriented = orient_camera(benchmark_frame, geometry, camera_mount, joint_station_m, apriori, edits.pose)
@@ -319,7 +324,7 @@ def read_film(
         fits.append(oriented.fit(edited(picture, edits, t_s, fixed), axis, start))
         start, before = np.zeros(2) if fits[-1].refused else fits[-1].rotation_yz_rad, picture
     if len(fits) != len(times):
-        raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="frame-count")
+        raise GateError(f"{len(times)} frame times for {len(fits)} frames", code="argument-value")
     benchmark_s = float(times[nearest])
     fits = judged(times, fits, joint_swing, edits, benchmark_s if has_texture(oriented) else None)
     if axis is not None and all(fit.refused for fit in fits) and oriented.edge_in_view < _EDGE_FOR_PLANE:
@@ -351,13 +356,13 @@ def judged(
     verdicts = [edits.verdict(float(t)) for t in time_s]
     rejected = [v is not None and v.edit == "reject" for v in verdicts]
     kept = [
-        refused_fit(fit.horizon, Fault(f"rejected by hand: {verdict.note or 'no reason given'}", "rejected-by-hand"))
+        refused_fit(fit.horizon, Issue(f"rejected by hand: {verdict.note or 'no reason given'}", "rejected-by-hand"))
         if verdict is not None and out
         else fit
         for fit, verdict, out in zip(fits, verdicts, rejected, strict=True)
     ]
     found = without_lost_features(kept) if textured_s is None else without_stray_texture(time_s, kept, textured_s)
-    found = without_remnants(without_doubtful(without_moved(without_mixed(found))))
+    found = without_remnants(without_doubtful(without_moved(found)))
     if joint_swing is not None:
         found = without_jumps(time_s, found, joint_swing)
     accepted = [v is not None and v.edit == "accept" for v in verdicts]
@@ -373,7 +378,7 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
 def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse frames answered by the edge alone, where it does not contradict features that were found."""
     words = "no feature agrees where other frames show some that do: whether the edge is the shell's is not known"
-    lost = Fault(words, "features-lost")
+    lost = Issue(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
 
@@ -392,7 +397,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
     if with_texture.sum() >= _LEAST_PAINTED and np.mean(agreed[with_texture]) > _PAINTED * agreed.max():
         return _without_bare(fits)
     words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
-    fault = Fault(words, "texture-strays")
+    fault = Issue(words, "texture-strays")
     return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]
 
 
@@ -403,32 +408,7 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
     if len(shown) < _LEVEL_FRAMES or refused <= _MOST:
         return fits
     words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
-    return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mostly-refused")) for fit in fits]
-
-
-def without_mixed(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse frames that have the noise of an earlier one, and a film of which some do, or show the edge twice.
-
-    A converter of frame rates does that to a whole film: its others mix pictures too, with edges closer together.
-    Frames count that may show the edge twice: one alone may by chance.
-    """
-    mixed = mixed_with([None if fit.refused else fit.noise for fit in fits])
-    doubled = {k for k, f in enumerate(fits) if getattr(f.refused, "code", "") == "picture-doubled" or f.doubled > 0.0}
-    some = len(doubled | set(mixed))
-    if some >= max(_LEAST_MIXED, _MIXED * len(fits)):
-        words = (
-            f"{some} frames show, or may show, the edge twice or the noise of a frame before: the film mixes pictures; "
-            "an edge may lie between two"
-        )
-        return [fit if fit.refused else refused_fit(fit.horizon, Fault(words, "film-mixed")) for fit in fits]
-    out = list(fits)
-    for k, (j, share) in mixed.items():
-        words = (
-            f"its noise is in part (correlation {share:.2f}) that of {k - j} frames before: a picture mixed with that "
-            "one, or a part of it held over"
-        )
-        out[k] = refused_fit(fits[k].horizon, Fault(words, "picture-mixed"))
-    return out
+    return [fit if fit.refused else refused_fit(fit.horizon, Issue(words, "film-mostly-refused")) for fit in fits]
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
@@ -447,10 +427,10 @@ def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
     for k, fit in enumerate(fits):
         at, fault = int(np.searchsorted(telling, k)), NO_FAULT
         if np.isnan(fit.mount_px) and moved[max(at - 1, 0) : at + 1].any():
-            fault = Fault(unseen, "camera-turned")
+            fault = Issue(unseen, "camera-turned")
         elif not np.isnan(fit.mount_px) and moved[at]:
             words = f"the centerbody's own edge has moved by up to {fit.mount_px:.1f} px, here and in a frame beside it"
-            fault = Fault(f"{words}: the camera moved in its mount, or the picture was moved", "camera-turned")
+            fault = Issue(f"{words}: the camera moved in its mount, or the picture was moved", "camera-turned")
         out.append(refused_fit(fit.horizon, fault) if fault and not fit.refused else fit)
     return out
 
@@ -467,7 +447,7 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     for k, fit in enumerate(fits):
         around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
         doubtful = not fit.refused and int(around.sum()) >= _DOUBTFUL
-        out.append(refused_fit(fit.horizon, Fault(words, "frames-around-refused")) if doubtful else fit)
+        out.append(refused_fit(fit.horizon, Issue(words, "frames-around-refused")) if doubtful else fit)
     return out
 
 
@@ -515,7 +495,7 @@ def without_jumps(time_s: FloatArray, fits: list[FrameFit], swing: JointSwing) -
             f"jumps by {np.rad2deg(min(change[k - 1], change[k])):.1f} deg from both neighbours, faster than the joint "
             f"swings at {swing.frequency_hz:.1f} Hz"
         )
-        out[answered[k]] = refused_fit(out[answered[k]].horizon, Fault(words, "jump-too-fast"))
+        out[answered[k]] = refused_fit(out[answered[k]].horizon, Issue(words, "jump-too-fast"))
     return out
 
 
@@ -549,7 +529,7 @@ def _benchmark_index(times_s: FloatArray, benchmark_time_s: float) -> int:
         raise GateError(
             f"no frame within 2 s of the benchmark time {benchmark_time_s} s; frames span {times_s[0]:.2f} to "
             f"{times_s[-1]:.2f} s",
-            code="benchmark-missing",
+            code="time-not-covered",
         )
     return nearest
 

@@ -4,8 +4,7 @@ Where the shell is may be known from the frame before; else it is sought: where 
 is from far, where the map of features or of the valleys between tori fits (behind the rim may be the Earth, whose limb
 is an edge too). Edge and features near there are fitted (`estimators.frame_solution`), each also by itself: where they
 contradict each other a whole edge counts, and a frame whose edge is not whole is refused. So is a frame that a
-deflection does not explain (`estimators.frame_checks`), that shows the edge twice (`estimators.edge`), or the
-centerbody elsewhere (`estimators.body_edge`).
+deflection does not explain (`estimators.frame_checks`), or in which the centerbody has moved (`estimators.body_edge`).
 
 Assumed: as in `estimators.frame_solution`.
 
@@ -25,13 +24,11 @@ from numpy.typing import NDArray
 
 from estimators.body_edge import UNMOVED, UNSEEN, MountMotion
 from estimators.edge import (
-    NO_FAULT,
     HorizonLine,
     breaks_across,
     fault_of_frame,
     is_coherent,
     no_horizon,
-    second_edge,
     steepness_of,
 )
 from estimators.features import ImageFeatures, fit_feature_map, valleys
@@ -55,8 +52,8 @@ from estimators.frame_solution import (
     refused_fit,
 )
 from estimators.texture import PaintedTexture
-from estimators.virtual_camera import DEFLECTION, RADIUS
-from flightmodel.checks import Fault, FloatArray
+from estimators.virtual_camera import DEFLECTION
+from flightmodel.checks import NO_FAULT, FloatArray, Issue
 from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
@@ -146,7 +143,7 @@ class OrientedCamera(FrameModel):
         fault = fault_of_frame(frame.kept, self.view.camera.size_px) or self._fault_of_breaks(frame)
         if fault:
             return refused_fit(no_horizon(fault), fault)
-        deformation, basis, horizon, doubled, moved_var = np.zeros(3), np.eye(2), _NOTHING, 0.0, 0.0
+        deformation, basis, horizon, moved_var = np.zeros(3), np.eye(2), _NOTHING, 0.0
         deformation[:2] = 0.0 if start is None else start
         with_open_plane: FrameFit | None = None
         mount = self._mount(frame)
@@ -165,7 +162,6 @@ class OrientedCamera(FrameModel):
             if not horizon.is_by_hand:
                 if place is not None and not contradicted:
                     self._check_seen(horizon, last)
-                doubled = self._doubled(frame, horizon, deformation)
                 self._check_sharp(frame, horizon)
                 if mount.px > 0.0 and self._stays(mount, last):
                     mount = UNMOVED
@@ -190,12 +186,11 @@ class OrientedCamera(FrameModel):
             return refused_fit(horizon, refusal.faults[0], mount.px, mount.is_sure)
         answer = self._answer(horizon, deformation, last, basis, moved_var)
         return replace(
-            answer, contradicted=contradicted, doubled=doubled, mount_px=mount.px, mount_is_sure=mount.is_sure,
+            answer, contradicted=contradicted, mount_px=mount.px, mount_is_sure=mount.is_sure,
             with_open_plane=with_open_plane,
-            noise=None if self.noise_places is None else self.noise_places.noise(frame, deformation[:2]),
         )  # fmt: skip
 
-    def _fault_of_breaks(self, frame: EditedFrame) -> Fault:
+    def _fault_of_breaks(self, frame: EditedFrame) -> Issue:
         """Whether the picture breaks across its width where the benchmark frame, which may have a border, does not.
 
         What is hidden, as a line of text, may be as wide.
@@ -204,7 +199,7 @@ class OrientedCamera(FrameModel):
             hidden = 0.0 if frame.hidden is None else float(frame.hidden[row : row + 2].mean())
             if hidden < _HIDDEN_BREAK and not np.any(np.abs(self.breaks - row) <= _SAME_BREAK_PX):
                 words = f"breaks across its width after row {row}, as the benchmark frame does not: rolled, or torn"
-                return Fault(words, "frame-broken")
+                return Issue(words, "frame-broken")
         return NO_FAULT
 
     def _explained(
@@ -267,14 +262,6 @@ class OrientedCamera(FrameModel):
                 f"features are seen where {100.0 * wanted:.0f} % of one are needed",
                 "shell-little-seen",
             )
-
-    def _doubled(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> float:
-        """Share of edge points that agree on a second edge; a frame that shows one is refused, by `estimators.edge`."""
-        rows = self.view.mismatch(horizon, self.view.edge(deformation))[1]
-        share, fault = second_edge(frame.kept, horizon, rows[:, DEFLECTION], rows[:, RADIUS])
-        if fault:
-            raise NoFitError(fault)
-        return share
 
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
         """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""
@@ -405,7 +392,7 @@ class OrientedCamera(FrameModel):
         """
         best: tuple[float, FloatArray, _Approached] | None = None
         turned = False
-        trouble = Fault("no edge near where one is expected", "edge-not-clear")
+        trouble = Issue("no edge near where one is expected", "edge-not-clear")
         for guess, reaches_px in self._guesses(frame, deformation.copy()):
             moved = guess.copy()
             try:

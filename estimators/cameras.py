@@ -33,9 +33,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
-from scipy.special import chdtrc
 
-from estimators.agreement import CONFIDENCE, agreement
+from estimators.agreement import Pair, agreement
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections
 from estimators.deflection_spline import inverse
 from estimators.evidence import (
@@ -118,30 +117,6 @@ class CameraReadings:
 
 
 @dataclass(frozen=True)
-class CameraTest:
-    """Chi-square of two cameras' differences, or of one camera's own biases (``cameras`` has one name)."""
-
-    cameras: tuple[str, ...]
-    chi_square: float
-    degrees: int
-
-    @property
-    def p_value(self) -> float:
-        """Probability of a larger chi-square."""
-        return float(chdtrc(self.degrees, self.chi_square))
-
-    @property
-    def passed(self) -> bool:
-        """Whether it is within the stated uncertainties."""
-        return self.p_value > 1.0 - CONFIDENCE
-
-    @property
-    def words(self) -> str:
-        """What was tested, for the middle of a sentence."""
-        return " and ".join(self.cameras) if len(self.cameras) > 1 else f"{self.cameras[0]} and the others"
-
-
-@dataclass(frozen=True)
 class JoinedCameras:
     """One answer of several cameras.
 
@@ -149,7 +124,7 @@ class JoinedCameras:
     ----------
     at_frames, smooth : DeflectionHistory
         At all used frames' times, and at any time; method ``"camera"``.
-    tests : tuple of CameraTest
+    tests : tuple of Pair
         Of all cameras, at their stated uncertainties.
     left_out : str or None
         Camera that contradicts the others, which agree without it.
@@ -162,7 +137,7 @@ class JoinedCameras:
 
     at_frames: DeflectionHistory
     smooth: DeflectionHistory
-    tests: tuple[CameraTest, ...]
+    tests: tuple[Pair, ...]
     left_out: str | None
     wider: float
     fused: Fused
@@ -183,14 +158,14 @@ class JoinedCameras:
         """The camera left out, else those of the worst test; empty where all agree."""
         if self.agree:
             return ""
-        return self.left_out or " and ".join(min(self.tests, key=lambda test: test.p_value).cameras)
+        return self.left_out or " and ".join(min(self.tests, key=lambda test: test.p_value).methods)
 
     @property
     def remark(self) -> str:
         """One sentence."""
         if self.agree:
             return "the cameras agree within their stated uncertainties"
-        failed = ", ".join(test.words for test in self.tests if not test.passed)
+        failed = ", ".join(" and ".join((*t.methods, "the others")[:2]) for t in self.tests if not t.passed)
         words = f"{failed}: readings differ beyond the cameras' stated uncertainties"
         if self.left_out is not None:
             return f"{words}; the others agree without {self.left_out}, which is left out"
@@ -218,7 +193,7 @@ class JoinedCameras:
             if timing in inputs:
                 mean, cov = inputs[timing]
                 late, late_sd = (float(x) * one.late_against(self.clock) for x in (mean[0], np.sqrt(cov[0, 0])))
-            chance = min((t.p_value for t in self.tests if one.name in t.cameras), default=np.nan)
+            chance = min((t.p_value for t in self.tests if one.name in t.methods), default=np.nan)
             used = one.name != self.left_out
             span = (float(known[0]), float(known[-1])) if len(known) else (np.nan, np.nan)
             rows.append((one.name, used, one.frames, *span, one.read.benchmark_s, *bias, late, late_sd, chance))
@@ -294,10 +269,10 @@ def best_clock(cameras: list[CameraReadings]) -> CameraReadings:
     return min(cameras, key=lambda one: one.read.time_bias_sd_s)
 
 
-def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[CameraTest]]:
+def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[Pair]]:
     """Posterior of some cameras, and the tests of their agreement."""
     if not cameras:
-        raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-readings")
+        raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-data")
     evidence = [one.evidence(best_clock(cameras), wider) for one in cameras]
     known = np.sort(np.concatenate([one.time_s for one in evidence]))
     grid = np.arange(np.ceil(known.min() * _RATE_HZ), np.floor(known.max() * _RATE_HZ) + 1.0) / _RATE_HZ
@@ -334,15 +309,14 @@ def _timed(evidence: list[Evidence], fused: Fused) -> list[Evidence]:
     return out
 
 
-def _pair_tests(evidence: list[Evidence], fused: Fused) -> list[CameraTest]:
+def _pair_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
     """Differences of every two cameras where both look; the motion between their frames is taken out first."""
     still = [replace(e, theta_yz_rad=e.theta_yz_rad - fused.deflection(e.time_s)) for e in _timed(evidence, fused)]
     pairs = agreement(still).pairs
-    names = [tuple(m.removeprefix("camera ") for m in pair.methods) for pair in pairs]
-    return [CameraTest(n, pair.chi_square, pair.degrees) for n, pair in zip(names, pairs, strict=True)]
+    return [replace(pair, methods=tuple(m.removeprefix("camera ") for m in pair.methods)) for pair in pairs]
 
 
-def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[CameraTest]:
+def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
     """How far each camera is off the others where it may be off by anything, over the sd that all errors leave.
 
     The process's size is then the motion's own: taken as motion, an offset at a switch would make it large enough to
@@ -362,7 +336,7 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[CameraTest]:
         covariance = inverse(precision)
         if np.trace(covariance) < 2.0 - _LEAST_INFORMATION:  # else nothing connects it with the others
             square = float(mean @ np.linalg.solve(covariance, mean))
-            out.append(CameraTest((one.method.removeprefix("camera "),), square, 2))
+            out.append(Pair((one.method.removeprefix("camera "),), square, 2))
     return out
 
 

@@ -19,6 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solve_triangular, solveh_banded
 from scipy.linalg.lapack import dpotri
 from scipy.sparse import coo_array, csr_array, dia_array, eye_array, kron
@@ -35,6 +36,7 @@ SIZE_RADPS2, SIZE_LOG_SD = 3.0, 1.5
 # allowance for neglected terms, no noise, may hide it from the evidence; ten degrees at 12 Hz
 _SIZES_RADPS2, FREE_RADPS2 = (0.1, 1e3), 1e3
 DEFLECTION_SD_RAD = 1.0  # of the deflection itself: no information
+_BASIS = BSpline.basis_element(np.arange(5.0))  # the cubic one, of knots one apart
 _WITHOUT_SAMPLES = 1e-12  # weight of a coefficient that no sample reaches, of one that they reach
 Inputs = dict[str, FloatArray]
 
@@ -72,16 +74,8 @@ class Spline:
         """Numbers (n, 4) and values of the basis functions that differ from zero at times (n,), or of derivatives."""
         at = (np.clip(time_s, self.knots_s[0], self.knots_s[-1]) - self.knots_s[0]) / self.step_s
         first = np.asarray(np.minimum(at.astype(np.int64), len(self.knots_s) - 2))
-        u = at - first
-        if derivative == 0:
-            rest = 1.0 - u
-            value = [rest**3, (3.0 * u - 6.0) * u**2 + 4.0, (3.0 * rest - 6.0) * rest**2 + 4.0, u**3]
-        elif derivative == 1:
-            rest = 1.0 - u
-            value = [-3.0 * rest**2, (9.0 * u - 12.0) * u, (12.0 - 9.0 * rest) * rest, 3.0 * u**2]
-        else:
-            value = [6.0 * (1.0 - u), 18.0 * u - 12.0, 6.0 - 18.0 * u, 6.0 * u]
-        return first[:, None] + np.arange(4), np.column_stack(value) / (6.0 * self.step_s**derivative)
+        value = _BASIS((at - first)[:, None] + np.arange(3.0, -1.0, -1.0), derivative)
+        return first[:, None] + np.arange(4), value / self.step_s**derivative
 
     def rows(self, time_s: FloatArray, derivative: int = 0) -> csr_array:
         """Values (n, count) of every basis function, or of its first or second derivative."""
@@ -347,7 +341,7 @@ def inverse_in_band(factor: FloatArray) -> csr_array:
 
 
 def _undetermined(method: str) -> DivergenceError:
-    return DivergenceError(f"{method}: the readings do not determine the deflection", code="deflection-undetermined")
+    return DivergenceError(f"{method}: the readings do not determine the deflection", code="not-observable")
 
 
 def upper_band(matrix: csr_array) -> FloatArray:

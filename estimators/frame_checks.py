@@ -25,8 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from estimators import _fit_kernels
-from estimators.edge import NO_FAULT
-from flightmodel.checks import Fault, FloatArray
+from flightmodel.checks import NO_FAULT, FloatArray, Issue
 
 USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
 # chi-square that one sound frame in 10,000 exceeds: of seventeen of shape and light, of three rotations and a focal
@@ -121,7 +120,7 @@ class Design:
         return motion, square
 
 
-def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> tuple[Fault, float]:
+def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> tuple[Issue, float]:
     """Why a deflection does not explain a frame, with its code; empty where it does.
 
     Last: variance, rad^2, of either component of the answer by what is no fault, but more than chance.
@@ -138,13 +137,13 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
     """
     if rms_px > USUAL_RMS_PX:
         words = f"rms {rms_px:.1f} px where {USUAL_RMS_PX:.1f} px are allowed"
-        return Fault(f"no deflection explains edge and features: {words}", "edge-not-shell"), 0.0
+        return Issue(f"no deflection explains edge and features: {words}", "edge-not-shell"), 0.0
     if shape @ shape > WORST_SHAPE:
         words = (
             f"shape and light would have to be {np.sqrt(shape @ shape / len(shape)):.1f} sd (rms of {len(shape)}) from "
             f"the benchmark frame's, where {np.sqrt(WORST_SHAPE / len(shape)):.1f} are allowed"
         )
-        return Fault(words, "edge-not-shell"), 0.0
+        return Issue(words, "edge-not-shell"), 0.0
     together = float(shape @ shape)
     turn, square = design.motion(design.turn, lobes_rad)
     together += square
@@ -153,7 +152,7 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
             f"the camera seems turned by {np.rad2deg(np.linalg.norm(turn[:3])):.1f} deg in its mount and zoomed by "
             f"{100.0 * turn[3]:.1f} % since the benchmark frame, or edge and features are not the shell's alone"
         )
-        return Fault(words, "camera-turned"), 0.0
+        return Issue(words, "camera-turned"), 0.0
     # by so much it would move the answer; a sound frame's chi-square is as large as the number of terms in the mean
     variance = _beyond(square, len(turn)) * float(np.sum(design.answer_to(design.turn @ turn) ** 2))
     warp, square = design.motion(design.warp, lobes_rad * design.focal_px)
@@ -162,18 +161,18 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
             f"the picture seems warped by up to {np.abs(design.warp @ warp).max():.0f} px since the benchmark frame: a "
             "drop on the lens, rows that slip, or edge and features are not the shell's alone"
         )
-        return Fault(words, "picture-warped"), 0.0
+        return Issue(words, "picture-warped"), 0.0
     if together + square > _WORST_TOGETHER:
         words = (
             f"shape, turn and warp of the picture together are improbable (chi-square {together + square:.0f} of "
             f"{len(shape) + len(turn) + len(warp)}): rows that slip, or edge and features are not the shell's alone"
         )
-        return Fault(words, "picture-warped"), 0.0
+        return Issue(words, "picture-warped"), 0.0
     fault, apart = _fault_of_halves(design)
     return fault, variance + apart
 
 
-def _fault_of_halves(design: Design) -> tuple[Fault, float]:
+def _fault_of_halves(design: Design) -> tuple[Issue, float]:
     """As `fault_of_fit`, of the halves of the features."""
     if design.edge_points == len(design.columns):
         return NO_FAULT, 0.0
@@ -186,7 +185,7 @@ def _fault_of_halves(design: Design) -> tuple[Fault, float]:
                 f"features in the upper and the lower half of the picture give deflections {np.rad2deg(off_rad):.1f} "
                 "deg apart: rows that slip, or two pictures in one"
             )
-            return Fault(words, "halves-differ"), 0.0
+            return Issue(words, "halves-differ"), 0.0
         # light on another renderer's cloth moves left against right by nearly as much, 17 at the most in 143 frames:
         # more is no fault there, but which half is right is not known, nor how far both err together
         variance += _beyond(square, _WORST_HALVES) * off_rad**2

@@ -193,7 +193,7 @@ def marked_on_shell(view: VirtualCamera, features_px: Mapping[str, FloatArray]) 
         raise GateError(
             f"camera edits: marked in the benchmark frame, {', '.join(off)} is not on the shell; mark it there, or "
             "remove it",
-            code="edit-off-shell",
+            code="edit-unusable",
         )
     return names, seen.points_shell_m
 

@@ -38,15 +38,14 @@ from numpy.typing import NDArray
 
 from estimators import _fit_kernels
 from estimators.body_edge import BodyEdge
-from estimators.edge import NO_FAULT, HorizonLine, ScanLines
+from estimators.edge import HorizonLine, ScanLines
 from estimators.features import Features, ImageFeatures, light_shift
 from estimators.frame_checks import WORST_SHAPE
 from estimators.frame_edits import LEAST_MARKS, MarkedFeatures
 from estimators.frame_residuals import HUBER, ROUND_WAVES, WAVES, FrameResiduals, FrameShape, light_columns, waves_round
-from estimators.surface_noise import NoisePlaces, SurfaceNoise, noise_places
 from estimators.texture import PaintedTexture
 from estimators.virtual_camera import CAMERA, DEFLECTION, HELD, VirtualCamera
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, GateError, Issue
 from flightmodel.deflection import lv_clock
 
 STEPS = 12  # a bound, for Gauss-Newton from a few pixels away
@@ -129,12 +128,10 @@ class FrameFit:
     features : int
         Rows of features used.
     horizon : HorizonLine
-    refused : Fault
+    refused : Issue
         Why there is no answer; empty when there is one.
     contradicted : bool
         Whether a whole edge alone gave the answer, against the features.
-    doubled : float
-        Share of edge points that agree on a second edge; zero if usual.
     mount_px : float
         How far the centerbody's own edge has moved in the picture; NaN where unknown.
     mount_is_sure : bool
@@ -145,8 +142,6 @@ class FrameFit:
         Error per unit error of the shell's shape under load as the film determined it, where that was used.
     with_open_plane : FrameFit or None
         Of the same frame with its plane estimated, where one is assumed.
-    noise : SurfaceNoise or None
-        Of the picture inside the shell's edge.
     moved_var : float
         Part of either component's variance by a motion of the picture that may be, with the plane estimated; see
         `estimators.frame_checks`.
@@ -160,15 +155,13 @@ class FrameFit:
     residual_rms_px: float
     features: int
     horizon: HorizonLine
-    refused: Fault = NO_FAULT
+    refused: Issue = NO_FAULT
     contradicted: bool = False
-    doubled: float = 0.0
     mount_px: float = float("nan")
     mount_is_sure: bool = True
     shape: FrameShape | None = None
     by_shape: FloatArray | None = None
     with_open_plane: FrameFit | None = None
-    noise: SurfaceNoise | None = None
     moved_var: float = 0.0
 
 
@@ -235,7 +228,7 @@ def least_points(horizon: HorizonLine) -> int:
 
 
 def refused_fit(
-    horizon: HorizonLine, reason: Fault, mount_px: float = float("nan"), mount_is_sure: bool = True
+    horizon: HorizonLine, reason: Issue, mount_px: float = float("nan"), mount_is_sure: bool = True
 ) -> FrameFit:
     """Return the fit of a frame that has no answer."""
     nan = np.full((2, 2), np.nan)
@@ -270,7 +263,7 @@ class FrameModel:
         Their shift per radian of deflection of the benchmark frame.
     residual_rms_px : float
         Of the benchmark frame.
-    stated_refused : Fault
+    stated_refused : Issue
         Why the features that the vehicle file states are not used; empty where they are, or where it states none.
     support : float
         Share of what the orientation looked for on the shell, features or the valleys between tori, that the benchmark
@@ -294,7 +287,7 @@ class FrameModel:
     posed_covariance: FloatArray = field(repr=False)
     posed_per_deflection: FloatArray = field(repr=False)
     residual_rms_px: float
-    stated_refused: Fault = NO_FAULT
+    stated_refused: Issue = NO_FAULT
     support: float = 1.0
     breaks: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp), repr=False)
     steepness: float = float("nan")
@@ -335,14 +328,6 @@ class FrameModel:
     def edge_in_view(self) -> float:
         """Share of the edge looked for that the benchmark frame shows."""
         return self._edge_at_benchmark / max(len(self.clocks_rad), 1)
-
-    @cached_property
-    def noise_places(self) -> NoisePlaces | None:
-        """Pixels inside the benchmark frame's edge at which a frame's noise is looked at."""
-        rest = np.zeros(3)
-        lines = self.view.lines_at(self.clocks_rad, rest)
-        on_edge = HorizonLine(lines.origin_px, lines.inward_px, np.ones(len(lines.index)), lines.index)
-        return noise_places(self.view, lines, self.view.mismatch(on_edge, self.view.edge(rest))[1][:, DEFLECTION])
 
     def _edge_share(self, points: int) -> float:
         """So many edge points over those of the benchmark frame; none where that shows no edge."""

@@ -231,7 +231,7 @@ def fuse(
     readings = [e for e in read({}, None) if np.isfinite(e.theta_yz_rad).all(axis=1).sum() >= LEAST_SAMPLES]
     if not readings:
         raise DivergenceError(
-            f"{method}: no method has {LEAST_SAMPLES} readings of the deflection", code="too-few-readings"
+            f"{method}: no method has {LEAST_SAMPLES} readings of the deflection", code="too-few-data"
         )
     methods = [e.method for e in readings]
     # first every sample by itself, without shared errors: a deflection to be linear about
@@ -246,7 +246,7 @@ def fuse(
         if min(np.isfinite(e.theta_yz_rad).all(axis=1).sum() for e in readings) < LEAST_SAMPLES:
             raise DivergenceError(
                 f"{method}: the steps lead to deflections at which no method has an answer; see each method's own",
-                code="fusion-not-converged",
+                code="not-converged",
             )
         problem, before = equations_of(readings, inputs, span, knot_s), found
         if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
@@ -277,7 +277,7 @@ def fuse(
     raise DivergenceError(
         f"{method}: the deflection did not converge: after {MOST_STEPS} steps it still moves by {moved:.2g} sd, where "
         f"{SETTLED_SD:g} are allowed; see each method's own answer",
-        code="fusion-not-converged",
+        code="not-converged",
     )
 
 
@@ -301,7 +301,7 @@ def smoothed(
     if len(known) < LEAST_SAMPLES:
         raise DivergenceError(
             f"{history.method}: no smooth history of {len(known)} readings; {LEAST_SAMPLES} are the least",
-            code="too-few-readings",
+            code="too-few-data",
         )
     first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
     one = evidence_of_history(history)

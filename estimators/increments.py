@@ -210,7 +210,7 @@ def estimate_increments(reader: LoadsReader, fused: Fused) -> Increments:
     raise DivergenceError(
         f"aerodynamic increments: after {_MOST_STEPS} steps they still move by {moved:.2g} sd in all, where "
         f"{_SETTLED_SD:g} are allowed; check the coefficient table and its [uncertainty]",
-        code="increments-not-converged",
+        code="not-converged",
     )
 
 

@@ -228,7 +228,7 @@ def shell_shape(films: list[LoadedFilm]) -> ShellShape:
     """
     frames = sum(len(one.rows) for one in films)
     if frames < LEAST_FRAMES:
-        raise GateError(f"{frames} frames with a load where {LEAST_FRAMES} are needed", code="too-few-frames")
+        raise GateError(f"{frames} frames with a load where {LEAST_FRAMES} are needed", code="too-few-data")
     largest = max(float(np.nanmax(one.pressure_pa)) for one in films)
     loads = np.concatenate([one.shares(largest)[one.rows] for one in films])
     if np.ptp(loads) < _LEAST_LOAD:

@@ -129,7 +129,7 @@ def _span_means(history: DeflectionHistory, time_s: FloatArray, pressure_pa: Flo
     t, yz, cov = history.time_s[known], history.theta_yz_rad[known], cov[known]
     q = np.interp(t, time_s, pressure_pa)
     if len(t) == 0:
-        raise DivergenceError("Southwell plot: the history has no answer with a sd", code="too-few-spans")
+        raise DivergenceError("Southwell plot: the history has no answer with a sd", code="too-few-data")
     weight = q / np.trace(cov, axis1=1, axis2=2)
     direction = weight @ yz
     direction = direction / np.linalg.norm(direction)
@@ -169,7 +169,7 @@ def southwell(
     """
     if len(theta_rad) < LEAST_SPANS:
         raise DivergenceError(
-            f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are needed", code="too-few-spans"
+            f"Southwell plot: {len(theta_rad)} spans of {SPAN_S} s where {LEAST_SPANS} are needed", code="too-few-data"
         )
     from scipy.optimize import least_squares  # a tenth of a second, for whoever never fits
 
@@ -191,7 +191,7 @@ def southwell(
     if not fit.success or np.linalg.cond(normal) > 1e12 or beyond > _MOST_LOADS:
         raise DivergenceError(
             "Southwell plot: the deflection does not grow faster than the load: stiffness not observable",
-            code="stiffness-not-observable",
+            code="not-observable",
         )
     # of the logarithm of q_crit = top (1 + e^x)
     scale = np.diag([beyond / (1.0 + beyond), 1.0])
@@ -199,7 +199,7 @@ def southwell(
     if np.diag(np.linalg.inv(normal)).max() > _MOST_LOG_SD**2:
         raise DivergenceError(
             "Southwell plot: the deflection is within its error bars: neither stiffness nor offset observable",
-            code="stiffness-not-observable",
+            code="not-observable",
         )
     k = ndtri(0.5 + 0.5 * CONFIDENCE)
     crit, offset = top * (1.0 + beyond), float(np.exp(fit.x[1]))

@@ -231,7 +231,7 @@ class StaticTrim:
         if not growth > 0.0:
             raise GateError(
                 f"static trim: a growth of {growth:g} needs an infinitely stiff joint; give more than 0",
-                code="trim-growth-not-positive",
+                code="value-range",
             )
         return self.critical_stiffness_nmprad * (1.0 + growth) / growth
 

@@ -19,12 +19,10 @@ one frame.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from estimators.agreement import CONFIDENCE
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, Check, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import chi_square_quantile
 
@@ -34,66 +32,16 @@ _WORST_BY_LOAD = 2.0  # sd of the benchmark's prior, beyond which the readings' 
 _MISREAD = 10  # one frame of so many may be
 
 
-@dataclass(frozen=True)
-class Rest:
-    """What the film says of its benchmark frame's rest.
-
-    Parameters
-    ----------
-    theta_rad : float
-        Mean deflection of the frames with little load, of those before and those after the largest load the worse; or
-        without them that of the benchmark frame by its load; or without any load largest deflection of the frames on
-        the benchmark's quieter side (one of ten left out).
-    over_sd : float
-        The same over its sd.
-    limit : float
-        Largest ``over_sd`` that passes.
-    frames : int
-        Frames with little load, or on the quieter side; 0: none.
-    span_s : tuple of float
-        First and last of them, or the benchmark frame's time twice.
-    load_is_known : bool
-    """
-
-    theta_rad: float
-    over_sd: float
-    limit: float
-    frames: int
-    span_s: tuple[float, float]
-    load_is_known: bool = True
-
-    @property
-    def passed(self) -> bool:
-        """Whether the benchmark frame can be one at rest."""
-        return self.over_sd <= self.limit
-
-    @property
-    def remark(self) -> str:
-        """What was found, and where it fails what to do."""
-        size = np.rad2deg(self.theta_rad)
-        if not self.frames:
-            found = f"the benchmark frame's load deflects the shell by about {size:.2f} deg, and no frame has less"
-            return found if self.passed else f"{found}: state another benchmark_s, of a frame with little load"
-        first, last = self.span_s
-        if not self.load_is_known:
-            found = f"{self.frames} frames on one side of the benchmark frame ({first:.2f} to {last:.2f} s) show "
-            if self.passed:
-                return f"{found}the shell at rest"
-            return (
-                f"{found}up to {size:.2f} deg, {self.over_sd:.1f} sd from rest, those on its other side more: the "
-                "benchmark frame is under load: state another benchmark_s, of a frame before or after the load"
-            )
-        found = f"{self.frames} frames with little load ({first:.2f} to {last:.2f} s) show {size:.2f} deg on average"
-        if self.passed:
-            return found
-        advice = "the benchmark frame is under load (state benchmark_s of one of these), or the camera moved"
-        return f"{found}, {self.over_sd:.1f} sd from rest: {advice} in its mount"
+def _check(over_sd: float, limit: float, good: str, bad: str) -> Check:
+    """Check of a deflection over its sd, with what was found and, where it fails, what to do."""
+    passed, name = over_sd <= limit, "deflection without load over its sd"
+    return Check("camera-rest", name, over_sd, 0.0, limit, passed, good if passed else bad, "camera")
 
 
-def rest_of(
+def rest_check(
     history: DeflectionHistory, load: FloatArray, benchmark_s: float, prior_sd_rad: float, corrected: bool
-) -> Rest | None:
-    """Whether frames with little load show the shell at rest.
+) -> Check | None:
+    """Check that frames with little load show the shell at rest.
 
     Parameters
     ----------
@@ -109,7 +57,7 @@ def rest_of(
 
     Returns
     -------
-    Rest or None
+    Check or None
         None where neither frames nor load can tell.
     """
     at = int(np.argmin(np.abs(history.time_s - benchmark_s)))
@@ -133,17 +81,27 @@ def rest_of(
             mean, spread = _mean(theta[rows], covariance[rows] + by_load[:, None, None] ** 2 * np.eye(2))
             over_sd = float(np.sqrt(mean @ np.linalg.solve(spread + prior_sd_rad**2 * np.eye(2), mean)))
             first, last = (float(history.time_s[rows[k]]) for k in (0, -1))
-            found.append(Rest(float(np.linalg.norm(mean)), over_sd, limit, len(rows), (first, last)))
-        return max(found, key=lambda one: one.over_sd)
+            words = (
+                f"{len(rows)} frames with little load ({first:.2f} to {last:.2f} s) show "
+                f"{np.rad2deg(np.linalg.norm(mean)):.2f} deg on average"
+            )
+            advice = "the benchmark frame is under load (state benchmark_s of one of these), or the camera moved"
+            bad = f"{words}, {over_sd:.1f} sd from rest: {advice} in its mount"
+            found.append(_check(over_sd, limit, words, bad))
+        return max(found, key=lambda one: one.value)
     if corrected:
         return None
     by_load = float(per_load * load[at])
-    return Rest(by_load, by_load / prior_sd_rad, _WORST_BY_LOAD, 0, (benchmark_s, benchmark_s))
+    words = (
+        f"the benchmark frame's load deflects the shell by about {np.rad2deg(by_load):.2f} deg, and no frame has less"
+    )
+    bad = f"{words}: state another benchmark_s, of a frame with little load"
+    return _check(by_load / prior_sd_rad, _WORST_BY_LOAD, words, bad)
 
 
 def _by_sides(
     time_s: FloatArray, theta: FloatArray, covariance: FloatArray, answered: BoolArray, at: int, prior_sd_rad: float
-) -> Rest | None:
+) -> Check | None:
     """Whether all frames on one side of the benchmark frame show rest; None where a side has no answer."""
     number, found = np.arange(len(theta)), []
     for side in (number < at, number > at):
@@ -154,10 +112,15 @@ def _by_sides(
         square = np.einsum("ni,ni->n", theta[rows], np.linalg.solve(spread, theta[rows][:, :, None])[:, :, 0])
         worst = int(np.argsort(-square)[len(rows) // _MISREAD])
         limit = float(np.sqrt(chi_square_quantile(1.0 - (1.0 - CONFIDENCE) / len(rows), 2)))
-        size, over_sd = float(np.linalg.norm(theta[rows[worst]])), float(np.sqrt(square[worst]))
-        span = float(time_s[rows[0]]), float(time_s[rows[-1]])
-        found.append(Rest(size, over_sd, limit, len(rows), span, load_is_known=False))
-    return min(found, key=lambda one: one.over_sd / one.limit)
+        size, over_sd = np.rad2deg(np.linalg.norm(theta[rows[worst]])), float(np.sqrt(square[worst]))
+        first, last = time_s[rows[[0, -1]]]
+        words = f"{len(rows)} frames on one side of the benchmark frame ({first:.2f} to {last:.2f} s) show "
+        bad = (
+            f"{words}up to {size:.2f} deg, {over_sd:.1f} sd from rest, those on its other side more: the benchmark "
+            "frame is under load: state another benchmark_s, of a frame before or after the load"
+        )
+        found.append(_check(over_sd, limit, f"{words}the shell at rest", bad))
+    return min(found, key=lambda one: one.value / one.high)
 
 
 def _mean(readings: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -2,27 +2,80 @@
 
 Readable twins: `flightmodel.earth`, `flightmodel.rotations`. Importing this module also points numba's cache at a
 folder whose name carries a hash of every kernel source and the processor: numba does not notice a change in a callee
-of another file, so a stale cache must not be reachable.
+of another file, so a stale cache must not be reachable. Where the user's cache cannot be written, as in a container
+with a read-only file system, the folder is a temporary one of this process: that costs time, never the command.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import fcntl
 import hashlib
 import importlib.util
 import math
+import os
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import llvmlite.binding
 import numba
+import platformdirs
 from numba.core.caching import FunctionCache
 from numba.core.registry import CPUDispatcher
 
-from flightmodel._compiler_kernels import CacheFolder, PartCompiler, cache_folder
-
 # Contraction and reordering are allowed; assuming away NaN is not: telemetry marks gaps with it.
 FASTMATH = {"contract", "reassoc", "arcp", "nsz", "afn"}
+REMEDY = "set XDG_CACHE_HOME or NUMBA_CACHE_DIR to a folder that may be written"
+
+
+@dataclass(frozen=True)
+class CacheFolder:
+    """Folder of compiled kernels: None where there is none at all; ``remark`` says why it is not the usual one."""
+
+    path: Path | None
+    remark: str = ""
+
+
+def _cache_folder(name: str) -> CacheFolder:
+    """Make the folder ``name`` in the user's cache, or else in a temporary one that is removed with this process.
+
+    Child processes find the temporary one by NUMBA_CACHE_DIR. Where the home cannot be written, matplotlib keeps its
+    files here too, or it would make a folder of its own and two lines of warning.
+    """
+    base = Path(os.environ.get("NUMBA_CACHE_DIR") or platformdirs.user_cache_dir("postflight"))
+    try:
+        made = CacheFolder(_writable(base / name))
+    except OSError as fault:
+        made = _temporary_folder(name, f"{base}: {fault.strerror}")
+    if made.path is not None and not os.access(os.path.expanduser("~"), os.W_OK):
+        os.environ.setdefault("MPLCONFIGDIR", str(made.path.parent / "matplotlib"))
+    return made
+
+
+def _temporary_folder(name: str, why: str) -> CacheFolder:
+    words = f"the user's cache cannot be written ({why})"
+    for place in (None, "/dev/shm"):  # a read-only container has no /tmp, but shared memory
+        with contextlib.suppress(OSError):
+            folder = tempfile.TemporaryDirectory(prefix="postflight-", dir=place, ignore_cleanup_errors=True)
+            break
+    else:
+        return CacheFolder(None, f"{words}, nor temporary files: kernels are compiled in every process anew; {REMEDY}")
+    atexit.register(folder.cleanup)
+    os.environ["NUMBA_CACHE_DIR"] = folder.name
+    return CacheFolder(
+        _writable(Path(folder.name) / name), f"{words}: compiled kernels go when the command ends; {REMEDY}"
+    )
+
+
+def _writable(folder: Path) -> Path:
+    """Make a folder and put a file into it, or raise OSError: what exists may still be read-only."""
+    if folder.parts[0] == "~":
+        raise FileNotFoundError(None, "this user has no home")
+    folder.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=folder).close()
+    return folder
 
 
 def _point_cache_at_these_sources() -> CacheFolder:
@@ -32,7 +85,7 @@ def _point_cache_at_these_sources() -> CacheFolder:
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             for source in sorted(Path(folder).glob("*_kernels.py")):
                 digest.update(source.name.encode() + source.read_bytes())
-    cache = cache_folder(f"kernels-{digest.hexdigest()[:16]}")
+    cache = _cache_folder(f"kernels-{digest.hexdigest()[:16]}")
     numba.config.CACHE_DIR = str(cache.path or "")
     return cache
 
@@ -41,90 +94,58 @@ CACHE = _point_cache_at_these_sources()
 KEPT = CACHE.path is not None  # without a folder numba must not be asked for a cache: it would refuse to import
 
 
-class SharedCache(FunctionCache):
-    """A kernel's cache, to which one process at a time saves, and machine code alone.
+class _LockedCache(FunctionCache):
+    """numba's cache of a kernel, to which one process at a time saves.
 
-    Of numba's own, two processes that save at once may take one file for two signatures, and a later one would run
-    what was compiled for the other. It also keeps the code that was made into a machine's, for callers, which a kernel
-    has none of: to read it took each process 80 ms and 14 MB.
+    Of two that save at once numba may give one file to two signatures: a later process would run what was compiled for
+    the other.
     """
 
     def save_overload(self, signature, compiled):
         """Save under a lock; without one where the file system has none."""
-        library = compiled.library
-        whole = library._get_module_for_linking()
-        with contextlib.ExitStack() as held:
+        with (CACHE.path / "saving").open("w") as lock:
             with contextlib.suppress(OSError):
-                lock = held.enter_context((CACHE.path / "saving").open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX)
-            library._shared_module = _names_of(whole)
-            try:
-                super().save_overload(signature, compiled)
-            finally:
-                library._shared_module = whole
-
-    def load_overload(self, signature, context):
-        """Load; a caller that would be compiled with it is refused by numba then, as there is nothing to copy."""
-        compiled = super().load_overload(signature, context)
-        if compiled is not None:
-            compiled.library._shared_module = None
-        return compiled
-
-
-def _names_of(module):
-    """Functions of a module by their names alone, which numba wants to know of what it loads."""
-    names = [function.name for function in module.functions if not function.is_declaration]
-    return llvmlite.binding.parse_assembly("\n".join(f'define void @"{name}"() {{ ret void }}' for name in names))
+            super().save_overload(signature, compiled)
 
 
 def _kept(function, **options):
     """Compile for calls from Python, and keep what was compiled."""
-    dispatcher = numba.njit(cache=KEPT, **options)(function)
+    dispatcher = numba.njit(cache=KEPT, nogil=True, error_model="numpy", **options)(function)
     if KEPT and isinstance(dispatcher, CPUDispatcher):  # else numba is switched off
-        dispatcher._cache = SharedCache(dispatcher.py_func)
+        dispatcher._cache = _LockedCache(dispatcher.py_func)
     return dispatcher
 
 
 def kernel(function):
     """Compile with the project's settings: for what is called from Python only."""
-    return _kept(function, nogil=True, error_model="numpy", fastmath=FASTMATH)
-
-
-def exact_kernel(function):
-    """Compile as `kernel` does, but every operation as it is written: for what must round correctly."""
-    return _kept(function, nogil=True, error_model="numpy")
+    return _kept(function, fastmath=FASTMATH)
 
 
 class Part(CPUDispatcher):
-    """A function that is compiled into the kernels that call it, without an entry of its own.
+    """A function that is compiled into the kernels that call it.
 
-    Called from Python, as tests do, it becomes a kernel.
+    numba would compile it once more for every constant that it is called with, and an entry from Python each time: a
+    quarter of the time that all kernels take. Called from Python, as tests do, it becomes a kernel.
     """
 
     def __call__(self, *arguments):
         if not hasattr(self, "alone"):
-            options = {name: value for name, value in self.targetoptions.items() if name not in {*_INSIDE, "nopython"}}
-            self.alone = _kept(self.py_func, **options)
+            fastmath = self.targetoptions.get("fastmath", False)
+            self.alone = _kept(self.py_func, fastmath=fastmath)
         return self.alone(*arguments)
 
     def get_call_template(self, args, kws):
-        """Compile for a number once, and not again for every constant that it is called with."""
+        """Compile for the type of a number, not for its value."""
         return super().get_call_template([numba.types.unliteral(kind) for kind in args], kws)
 
 
-_INSIDE = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
-
-
 def _part(function, **options):
-    part = numba.njit(nogil=True, error_model="numpy", pipeline_class=PartCompiler, **options, **_INSIDE)(function)
+    options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "forceinline": True}
+    part = numba.njit(nogil=True, error_model="numpy", **options)(function)
     if isinstance(part, CPUDispatcher):  # else numba is switched off
         part.__class__ = Part
     return part
-
-
-def exact_inlined(function):
-    """Compile as `exact_kernel` does, as a part of every kernel that calls it."""
-    return _part(function)
 
 
 def inlined(function):

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -39,17 +40,17 @@ from typing import Annotated, Any, Literal
 from xml.parsers import expat
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, TableRangeError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, TableRangeError
 from flightmodel.config import (
     FileBeside,
     Fraction,
-    KeyFaults,
+    KeyFault,
     Length,
     Place,
     Section,
-    check_one_of,
+    one_of,
     read_section,
 )
 from flightmodel.files import file_bytes, nothing_at
@@ -125,7 +126,7 @@ class AeroTable:
             raise TableRangeError(
                 f"aerodynamic table: Mach {m.flat[bad]:.3f}, angle {np.rad2deg(a.flat[bad]):.2f} deg "
                 f"lies outside Mach >= 0, 0 to {np.rad2deg(self.alpha_rad[-1]):.0f} deg",
-                code="aero-range",
+                code="table-range",
             )
         from scipy.interpolate import RegularGridInterpolator  # half a second to import
 
@@ -173,20 +174,20 @@ def check_axial_flow(path: Path, table: AeroTable) -> None:
         if abs(value) > AXIAL_TOLERANCE
     ]
     if faults:
-        raise GateError(faults[:MOST_FAULTS], code="aero-axial-flow")
+        raise GateError(faults[:MOST_FAULTS], code="aero-grid")
 
 
-def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Fault]:
+def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Issue]:
     """Say what no row of a coefficient table may hold; ``row`` is finite, in the order of ``names``."""
     mach, alpha = row[:2]
     faults = (
-        [] if mach >= 0.0 else [Fault(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "aero-mach")]
+        [] if mach >= 0.0 else [Issue(f"column '{names[0]}': {mach:g}; a Mach number is not negative", "value-range")]
     )
     if not 0.0 <= alpha <= 180.0:
-        faults.append(Fault(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "aero-angle"))
+        faults.append(Issue(f"column '{names[1]}': {alpha:g}; an angle from 0 to 180 deg is wanted", "value-range"))
     if alpha == 0.0:
         off = [k for k in (3, 4) if abs(row[k]) > AXIAL_TOLERANCE]
-        faults += [Fault(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-axial-flow") for k in off]
+        faults += [Issue(f"column '{names[k]}': {row[k]:g} at angle 0; {AXIAL_RULE}", "aero-grid") for k in off]
     return faults
 
 
@@ -227,9 +228,9 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
     for k, line in lines[1:]:
         row, wrong = _grid_point(line, names, columns)
         rows.append(row)
-        faults += [Fault(f"{path}, line {k}: {fault}", fault.code) for fault in wrong]
+        faults += [Issue(f"{path}, line {k}: {fault}", fault.code) for fault in wrong]
     if faults:
-        more = Fault(f"{path}: {len(faults)} faults in all", "more-faults")
+        more = Issue(f"{path}: {len(faults)} faults in all", "more-faults")
         raise GateError([*faults[:MOST_FAULTS], *[more] * (len(faults) > MOST_FAULTS)])
     return _on_grid(path, np.array(rows, dtype=float).reshape(-1, len(names)))
 
@@ -243,24 +244,24 @@ def _columns(path: Path, names: tuple[str, ...], head: tuple[int, str]) -> list[
         near = named_columns(names, header)
         meant = [f"'{near[c]}' looks like {c}: name it so" for c in missing if c in near]
         words = f"columns {', '.join(missing)} are missing; wanted {', '.join(names)}; found {', '.join(header)}"
-        raise GateError("; ".join([f"{path}: {words}", *meant]), code="aero-column-missing")
+        raise GateError("; ".join([f"{path}: {words}", *meant]), code="column-missing")
     twice = [c for c in names if header.count(c) > 1]
     if twice:
         words = f"columns {', '.join(twice)} stand twice; keep one of each"
-        raise GateError(f"{path}, line {head[0]}: {words}", code="column-twice")
+        raise GateError(f"{path}, line {head[0]}: {words}", code="given-twice")
     return header
 
 
-def _grid_point(line: str, names: tuple[str, ...], columns: list[str]) -> tuple[list[float], list[Fault]]:
+def _grid_point(line: str, names: tuple[str, ...], columns: list[str]) -> tuple[list[float], list[Issue]]:
     """Numbers of a line in the order of ``names``, and what is wrong with them."""
     cells = [cell.strip() for cell in line.split("#")[0].split(",")]
     if len(cells) != len(columns):
         words = f"{len(cells)} cells where {len(columns)} are wanted; got '{line.strip()}'"
-        return [], [Fault(words, "row-ragged")]
+        return [], [Issue(words, "row-ragged")]
     there = {c: cells[columns.index(c)] for c in names}
     row = [plain_number(cell) for cell in there.values()]
     bad = [c for c, value in zip(names, row, strict=True) if not np.isfinite(value)]
-    faults = [Fault(f"column '{c}': '{there[c]}' is no finite number", "not-a-number") for c in bad]
+    faults = [Issue(f"column '{c}': '{there[c]}' is no finite number", "not-a-number") for c in bad]
     return row, faults or _row_faults(row, names)
 
 
@@ -271,13 +272,13 @@ def _on_grid(path: Path, values: FloatArray) -> AeroTable:
     faults = []
     if len(values) != len(mach) * len(alpha_deg) or len(np.unique(values[:, :2], axis=0)) != len(values):
         wanted = f"{len(mach)} Mach x {len(alpha_deg)} angles, each once, are wanted"
-        faults.append(Fault(f"{path}: {len(values)} rows where {wanted}", "aero-grid"))
+        faults.append(Issue(f"{path}: {len(values)} rows where {wanted}", "aero-grid"))
     if len(alpha_deg) < 2 or len(mach) < 2 or np.ptp(np.diff(alpha_deg)) > 1e-9 or alpha_deg[0] != 0.0:
         words = "angles must be evenly spaced from 0, and at least two, as Mach numbers"
-        faults.append(Fault(f"{path}: {words}", "aero-grid"))
+        faults.append(Issue(f"{path}: {words}", "aero-grid"))
     elif abs(alpha_deg[-1] - 180.0) > 1e-9:
         words = f"angles end at {alpha_deg[-1]:g} deg; give rows to 180: above the air all are met"
-        faults.append(Fault(f"{path}: {words}", "aero-grid"))
+        faults.append(Issue(f"{path}: {words}", "aero-grid"))
     if faults:
         raise GateError(faults)
     grid = values[:, 2:].reshape(len(mach), len(alpha_deg), 4)
@@ -336,16 +337,16 @@ def read_daveml(path: Path, force_names: tuple[str, str] = ("CA", "CN")) -> Aero
         if not match:
             if coefficient != "CMQ":
                 faults.append(
-                    Fault(
+                    Issue(
                         f"{path}: no variable for {coefficient}: name it one of {', '.join(sorted(names))}",
-                        "daveml-variable",
+                        "daveml-unsupported",
                     )
                 )
         elif match[0] not in functions:
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: variable '{match[0]}' has no gridded function; tabulate it (calculations are not read)",
-                    "daveml-variable",
+                    "daveml-unsupported",
                 )
             )
         else:
@@ -368,7 +369,7 @@ def _parse(path: Path) -> ET.Element:
     def refuse(*_: Any) -> None:
         raise GateError(
             f"{path}: declares XML entities or its own document type; remove the DOCTYPE's [...] part",
-            code="daveml-doctype",
+            code="file-unreadable",
         )
 
     def doctype(_name: str, _system: str | None, _public: str | None, has_subset: int) -> None:
@@ -381,11 +382,11 @@ def _parse(path: Path) -> ET.Element:
         scout.Parse(data, True)
         root = ET.fromstring(data)
     except (expat.ExpatError, ET.ParseError) as fault:
-        raise GateError(f"{path}: not valid XML: {fault}", code="daveml-not-xml") from None
+        raise GateError(f"{path}: not valid XML: {fault}", code="file-unreadable") from None
     for element in root.iter():
         element.tag = str(element.tag).rsplit("}", 1)[-1]
     if root.tag != "DAVEfunc":
-        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc", code="daveml-not-xml")
+        raise GateError(f"{path}: its root is '{root.tag}', not DAVEfunc", code="file-unreadable")
     return root
 
 
@@ -396,7 +397,7 @@ def _numbers(path: Path, element: ET.Element | None, where: str, faults: list[st
     except ValueError:
         values = np.array([])
     if len(values) == 0 or not np.isfinite(values).all():
-        faults.append(Fault(f"{path}: '{where}' holds no list of finite numbers", "daveml-numbers"))
+        faults.append(Issue(f"{path}: '{where}' holds no list of finite numbers", "file-unreadable"))
     return values
 
 
@@ -413,9 +414,9 @@ def _grid(
         axes.append("mach" if alias & MACH_NAMES else "alpha" if alias & ALPHA_NAMES else "")
         if not axes[-1]:
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: '{output}' depends on '{name}'; only Mach number and angle of attack are read",
-                    "daveml-input",
+                    "daveml-unsupported",
                 )
             )
     definition = function.find("functionDefn")
@@ -425,35 +426,37 @@ def _grid(
         table = tables.get(link.get("gtID", "")) if link is not None else None
     if table is None:
         faults.append(
-            Fault(
+            Issue(
                 f"{path}: the function of '{output}' has no griddedTableDef; ungridded tables are not read",
-                "daveml-ungridded",
+                "daveml-unsupported",
             )
         )
         return None
     units = table.get("units") or (variables[output].get("units") or "")
     if units not in NO_UNITS:
-        faults.append(Fault(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unit"))
+        faults.append(
+            Issue(f"{path}: '{output}' is in '{units}'; coefficients without unit are read", "daveml-unsupported")
+        )
     grids = []
     for reference, name, axis in zip(table.findall("breakpointRefs/bpRef"), inputs, axes, strict=False):
         knots = points.get(reference.get("bpID", ""), np.array([]))
         unit = (variables[name].get("units") or "") if name in variables else ""
         if axis == "alpha" and unit not in ANGLE_UNITS:
-            faults.append(Fault(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unit"))
+            faults.append(Issue(f"{path}: '{name}' is in '{unit}'; deg or rad is read", "daveml-unsupported"))
         if len(knots) < 2 or (np.diff(knots) <= 0).any():
             faults.append(
-                Fault(
+                Issue(
                     f"{path}: breakpoints '{reference.get('bpID')}' do not increase or are not defined",
-                    "daveml-breakpoints",
+                    "file-unreadable",
                 )
             )
         grids.append(knots * ANGLE_UNITS.get(unit, 1.0) if axis == "alpha" else knots)
     values = _numbers(path, table.find("dataTable"), output, faults)
     if len(grids) != len(inputs) or not inputs or values.size != np.prod([len(g) for g in grids]):
         faults.append(
-            Fault(
+            Issue(
                 f"{path}: '{output}' has {values.size} values where its breakpoints want another number",
-                "daveml-breakpoints",
+                "file-unreadable",
             )
         )
     return None if len(faults) > before else (axes, grids, values.reshape([len(g) for g in grids]))
@@ -526,11 +529,10 @@ class Knots(Section):
     mach: tuple[MachNumber, ...]
     value: tuple[Factor, ...]
 
-    @model_validator(mode="after")
-    def _matched(self) -> Knots:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.mach or len(self.mach) != len(self.value) or not _increase(self.mach):
-            raise ValueError("as many values as Mach numbers, which increase, are wanted")
-        return self
+            yield "", None, "as many values as Mach numbers, which increase, are wanted"
 
 
 class DampingTable(Section):
@@ -540,14 +542,13 @@ class DampingTable(Section):
     alpha_deg: Annotated[tuple[Degrees, ...], Field(min_length=1)]
     value: tuple[tuple[Coefficient, ...], ...]
 
-    @model_validator(mode="after")
-    def _matched(self) -> DampingTable:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         sizes = {len(row) for row in self.value}
         if len(self.value) != len(self.mach) or sizes != {len(self.alpha_deg)}:
-            raise ValueError("one row a Mach number and one value an angle are wanted")
+            yield "", None, "one row a Mach number and one value an angle are wanted"
         if not _increase(self.mach) or not _increase(self.alpha_deg):
-            raise ValueError("Mach numbers and angles must increase")
-        return self
+            yield "", None, "Mach numbers and angles must increase"
 
 
 class SphereCone(Section):
@@ -562,20 +563,16 @@ class SphereCone(Section):
     cmq: Coefficient | None = None
     cmq_table: DampingTable | None = None
 
-    @model_validator(mode="after")
-    def _possible(self) -> SphereCone:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         widest = self.base_radius_m / float(np.cos(np.deg2rad(self.half_angle_deg)))
         if self.nose_radius_m >= widest:
             words = f"the nose cap is wider than the base; below {widest:.4g} m for this base and angle"
-            faults.append(("nose_radius_m", self.nose_radius_m, words))
+            yield "nose_radius_m", self.nose_radius_m, words
         if (self.cmq is None) == (self.cmq_table is None):
-            faults.append(("cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"))
+            yield "cmq", self.cmq, "either cmq or cmq_table is wanted, and not both"
         if not _increase(self.mach):
-            faults.append(("mach", self.mach, "Mach numbers must increase"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "mach", self.mach, "Mach numbers must increase"
 
 
 class FreeMolecular(Section):
@@ -592,10 +589,9 @@ class Aerodynamics(Section):
     sphere_cone: SphereCone | None = None
     free_molecular: FreeMolecular | None = None
 
-    @model_validator(mode="after")
-    def _one(self) -> Aerodynamics:
-        check_one_of(self, "table", "sphere_cone")
-        return self
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        yield from one_of(self, "table", "sphere_cone")
 
 
 @dataclass(frozen=True)
@@ -660,7 +656,7 @@ def read_with_sidecar(path: Path) -> tuple[AeroTable, Sidecar]:
         sidecar = read_section(Sidecar, beside)
     except ConfigError as fault:
         wanted = "; a table needs one beside it: source, licence, area_m2, length_m, moment_reference_station_m"
-        faults += fault.faults if beside.exists() else [Fault(f"{beside}: no such file{wanted}", "sidecar-missing")]
+        faults += fault.faults if beside.exists() else [Issue(f"{beside}: no such file{wanted}", "file-missing")]
     wind = sidecar is not None and sidecar.axes == "wind"
     names = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:]) if wind else COLUMNS
     try:

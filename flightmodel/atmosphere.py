@@ -59,35 +59,8 @@ _LAYERS = np.array(
         [71000.0, 214.65, -0.002],
     ]
 )
-# geometric height km, density kg/m^3, pressure Pa, as printed
-_UPPER = np.array(
-    [
-        [86, 6.958e-6, 3.7338e-1],
-        [90, 3.416e-6, 1.8359e-1],
-        [95, 1.393e-6, 7.5966e-2],
-        [100, 5.604e-7, 3.2011e-2],
-        [105, 2.325e-7, 1.4477e-2],
-        [110, 9.708e-8, 7.1042e-3],
-        [115, 4.289e-8, 4.0096e-3],
-        [120, 2.222e-8, 2.5382e-3],
-        [125, 1.291e-8, 1.7354e-3],
-        [130, 8.152e-9, 1.2505e-3],
-        [140, 3.831e-9, 7.2028e-4],
-        [150, 2.076e-9, 4.5422e-4],
-        [160, 1.233e-9, 3.0395e-4],
-        [180, 5.194e-10, 1.5271e-4],
-        [200, 2.541e-10, 8.4736e-5],
-        [250, 6.073e-11, 2.4767e-5],
-        [300, 1.916e-11, 8.7704e-6],
-        [400, 2.803e-12, 1.4518e-6],
-        [500, 5.215e-13, 3.0236e-7],
-        [600, 1.137e-13, 8.2130e-8],
-        [700, 3.070e-14, 3.1908e-8],
-        [800, 1.136e-14, 1.7036e-8],
-        [900, 5.759e-15, 1.0873e-8],
-        [1000, 3.561e-15, 7.5138e-9],
-    ]
-)
+TABLES = Path(__file__).parent / "data" / "atmosphere"
+_UPPER = np.loadtxt(TABLES / "us76_upper.csv", delimiter=",", skiprows=3)  # height km, density kg/m^3, pressure Pa
 # geometric height km, mole fraction of O, Ar, He and H together, of the number densities as printed; at 86 km none: the
 # 1.4 below leaves argon's 1 % out
 _ATOMS = np.array(
@@ -108,7 +81,6 @@ _WIND_CONSTANT = 1.0 / 3.0  # of a sounded wind's variance, beside waves and gus
 # a vehicle turns into gusts: those that no knot resolves look like a smaller C_m. 300 m are crossed at 1 km/s in half a
 # period of pitching at 1.7 Hz; with 1 km the C_m of a light vehicle at small angles came out 4 sd low
 _WAVE_KNOT_M = 300.0
-TABLES = Path(__file__).parent / "data" / "atmosphere"
 TOP_M = 1.0e6
 BOTTOM_M, BOTTOM_MARS_M = -5000.0, -10000.0  # Hellas lies 8 km below Mars's ellipsoid
 # height km, temperature K; below the first and above the last as there
@@ -149,7 +121,7 @@ def _in_range(name: str, altitude_m: FloatArray | float, lowest_m: float) -> Flo
     z = np.asarray(altitude_m, dtype=float)
     if not ((z >= lowest_m) & (z <= TOP_M)).all():
         words = f"altitude {np.min(z):.0f} to {np.max(z):.0f} m lies outside {lowest_m:.0f} to {TOP_M:.0f} m"
-        raise GateError(f"{name}: {words}", code="altitude-range")
+        raise GateError(f"{name}: {words}", code="value-range")
     return z
 
 
@@ -577,13 +549,13 @@ def nrlmsis_of(t0_utc: str, latitude_rad: float, longitude_rad: float, f107: flo
     Raises
     ------
     ConfigError
-        ``nrlmsis-missing`` without the library.
+        ``package-missing`` without the library.
     """
     try:
         import pymsis
     except ImportError:
         words = "NRLMSIS needs pymsis: pip install 'postflight[msis]', or choose base = \"us76\""
-        raise ConfigError(words, code="nrlmsis-missing") from None
+        raise ConfigError(words, code="package-missing") from None
     z = np.concatenate([np.arange(0.0, 130e3, 1000.0), np.arange(130e3, 200e3, 2000.0), np.arange(200e3, 4.01e5, 1e4)])
     time = np.datetime64(parse_utc(t0_utc).replace(tzinfo=None))
     east, north = np.rad2deg([longitude_rad, latitude_rad])

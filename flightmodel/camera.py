@@ -92,7 +92,7 @@ class Camera:
             object.__setattr__(self, name, value)
         dcm = self.dcm_cam_body
         if (np.abs(dcm @ dcm.T - np.eye(3)) > _SKEWNESS).any() or np.linalg.det(dcm) < 0.0:
-            raise GateError("camera.dcm_cam_body: not a rotation matrix", code="camera-rotation")
+            raise GateError("camera.dcm_cam_body: not a rotation matrix", code="argument-value")
         object.__setattr__(self, "half_field_rad", float(one_to_one_half_angle_rad(self.distortion, self.lens)))
 
     @cached_property

@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 
 from flightmodel import tables
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.files import write_file
 
 EDITS_FILE = "camera_edits.csv"
@@ -162,8 +162,8 @@ def read_edits(
     missing = [c for c in COLUMNS if c not in frame.columns]
     if missing:
         hints = [f"no column '{c}'{nearest_name(c, list(frame.columns))}" for c in missing]
-        raise GateError([f"{_LABEL}: {path}: line 1: {hint}" for hint in hints], code="table-column-missing")
-    faults: list[str] = []
+        raise GateError([f"{_LABEL}: {path}: line 1: {hint}" for hint in hints], code="column-missing")
+    faults: list[Issue] = []
     t, u, v, value = (tables.numbers(frame, c, path, _LABEL, faults) for c in ("t_s", "u_px", "v_px", "value"))
     if faults:
         raise GateError(faults)
@@ -174,7 +174,7 @@ def read_edits(
         where = f"{_LABEL}: {path}: line {tables.line_of(frame, k)}"
         if known is not None and own not in known:
             hint = f"{nearest_name(own, known)}; the vehicle has {', '.join(known)}"
-            found.append(Fault(f"{where}: camera '{own}'{hint}", "camera-unknown"))
+            found.append(Issue(f"{where}: camera '{own}'{hint}", "name-unknown"))
         if camera is None or own == camera:
             numbers = (float(u[k]), float(v[k]), float(value[k]))
             rows.append(Edit(own, float(t[k]), words["edit"][k], words["name"][k], *numbers, words["note"][k]))
@@ -187,12 +187,12 @@ def read_edits(
 
 def faults_of(
     rows: list[Edit], time_s: FloatArray, size_px: tuple[int, int], lines: list[str] | None = None
-) -> list[Fault]:
+) -> list[Issue]:
     """Say what is wrong with edits of one camera; empty where they can be used."""
     out = []
     for k, row in enumerate(rows):
         where = f"{lines[k]}: " if lines else f"{_LABEL}: edit {k + 1}: "
-        out += [Fault(where + fault, fault.code) for fault in _faults_of_row(row, time_s, size_px)]
+        out += [Issue(where + fault, fault.code) for fault in _faults_of_row(row, time_s, size_px)]
     if out:
         return out
     everything = CameraEdits(tuple(rows))
@@ -200,38 +200,38 @@ def faults_of(
         for corners in everything.masks_px(t):
             if len(corners) < LEAST_CORNERS:
                 words = f"{_LABEL}: a mask has {len(corners)} corners; {LEAST_CORNERS} are needed"
-                out.append(Fault(words, "edit-incomplete"))
+                out.append(Issue(words, "edit-unusable"))
     return out
 
 
-def _faults_of_row(row: Edit, time_s: FloatArray, size_px: tuple[int, int]) -> list[Fault]:
+def _faults_of_row(row: Edit, time_s: FloatArray, size_px: tuple[int, int]) -> list[Issue]:
     if row.edit not in EDITS:
         return [
-            Fault(f"edit '{row.edit}'{nearest_name(row.edit, EDITS)}; known are {', '.join(EDITS)}", "edit-unknown")
+            Issue(f"edit '{row.edit}'{nearest_name(row.edit, EDITS)}; known are {', '.join(EDITS)}", "edit-unusable")
         ]
     out = []
     if row.edit != "pose" and not (row.edit == "mask" and np.isnan(row.t_s)):
         apart = np.abs(time_s - row.t_s) if np.isfinite(row.t_s) else np.array([np.inf])
         if not len(apart) or apart.min() > SAME_FRAME_S:
             nearest = f"; the nearest is at {time_s[int(np.argmin(apart))]:.3f} s" if np.isfinite(apart).any() else ""
-            out.append(Fault(f"no frame at t_s = {row.t_s:g}{nearest}", "edit-no-frame"))
+            out.append(Issue(f"no frame at t_s = {row.t_s:g}{nearest}", "time-not-covered"))
     if row.edit in ("mask", "rim", "feature"):
         inside = -0.5 <= row.u_px <= size_px[0] - 0.5 and -0.5 <= row.v_px <= size_px[1] - 0.5
         if not inside:
             at = f"({row.u_px:g}, {row.v_px:g}) px"
-            out.append(Fault(f"{at} is outside the picture of {size_px[0]} x {size_px[1]}", "edit-outside-picture"))
+            out.append(Issue(f"{at} is outside the picture of {size_px[0]} x {size_px[1]}", "value-range"))
     if row.edit in ("mask", "feature") and not row.name:
-        out.append(Fault(f"a {row.edit} needs a name", "edit-incomplete"))
+        out.append(Issue(f"a {row.edit} needs a name", "edit-unusable"))
     if row.edit == "pose":
         low, high = _POSE_LIMITS.get(row.name, _POSE_DEG)
         if row.name not in POSE:
             words = f"pose '{row.name}'{nearest_name(row.name, POSE)}; known are {', '.join(POSE)}"
-            out.append(Fault(words, "edit-unknown"))
+            out.append(Issue(words, "edit-unusable"))
         elif not low <= row.value <= high:
-            out.append(Fault(f"{row.name} = {row.value:g}; {low:g} to {high:g} is wanted", "edit-out-of-range"))
+            out.append(Issue(f"{row.name} = {row.value:g}; {low:g} to {high:g} is wanted", "value-range"))
     if len(row.note) > _LONGEST_NOTE or len(row.name) > _LONGEST_NAME:
         words = f"a note has at most {_LONGEST_NOTE} characters, a name {_LONGEST_NAME}"
-        out.append(Fault(words, "edit-too-long"))
+        out.append(Issue(words, "value-range"))
     return out
 
 

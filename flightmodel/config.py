@@ -5,15 +5,24 @@ from __future__ import annotations
 import os
 import tomllib
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.files import file_bytes, leads_outside, nothing_at
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
@@ -58,19 +67,17 @@ def beside(value: str) -> str:
 
 FileBeside = Annotated[str, AfterValidator(beside)]
 
+# key below the table that is checked ("" for the table), its value, what is wrong; an `Issue` has its own code
+KeyFault = tuple[str, object, str]
+
 
 class KeyFaults(ValueError):
-    """What keys of a table do not fit each other; `parse_section` makes a sentence of each.
+    """What keys of a table do not fit each other; `parse_section` makes a sentence of each `KeyFault`."""
 
-    Parameters
-    ----------
-    faults : list of (str, object, str)
-        Key below the table that is checked, its value, what is wrong and what to try; a `Fault` has its own code.
-    """
-
-    def __init__(self, faults: list[tuple[str, object, str]]) -> None:
+    def __init__(self, faults: list[KeyFault]) -> None:
         self.faults = tuple(faults)
-        super().__init__("; ".join(f"{key} = {_shown(value)}: {words}" for key, value, words in faults))
+        shown = (f"{key} = {_shown(value)}: {words}" if key else words for key, value, words in faults)
+        super().__init__("; ".join(shown))
 
 
 class Section(BaseModel):
@@ -96,6 +103,16 @@ class Section(BaseModel):
             if isinstance(leaf, (int, float)) and wanted == {bool} and not isinstance(leaf, bool):
                 raise ValueError("true or false is wanted")
         return value
+
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what keys do not fit each other; each is sound by itself."""
+        return ()
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> Self:
+        if faults := [*self.key_faults()]:
+            raise KeyFaults(faults)
+        return self
 
 
 @cache  # a study checks the same few fields a hundred thousand times
@@ -130,7 +147,7 @@ SectionT = TypeVar("SectionT", bound=Section)
 def read_toml(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file, or raise `ConfigError` with the file, line and column."""
     if "\0" in str(path):
-        raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-nul")
+        raise ConfigError(f"{str(path)!r}: a path holds no NUL character", code="path-refused")
     try:
         return tomllib.loads(file_bytes(path, LARGEST_TOML_BYTES).decode("utf-8-sig").replace("\r\n", "\n"))
     except FileNotFoundError:
@@ -154,7 +171,7 @@ def read_section(model: type[SectionT], path: Path) -> SectionT:
         return parse_section(model, tables, str(path))
     except ConfigError as fault:
         absent = [
-            Fault(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
+            Issue(f"{path}: key '{key}': {path.parent / name}: {nothing_at(path.parent / name)}", "file-missing")
             for key, name in _named_files(tables)
             if not any(f"key '{key}'" in words for words in fault.faults) and not leads_outside(path.parent, name)
             if not os.path.exists(path.parent / name)  # False also for a name too long for a file
@@ -190,33 +207,31 @@ def _shown(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Fault]:
+def _sentences(where: str, model: type[BaseModel], item: Any) -> list[Issue]:
     """Faults that one item of pydantic's list means."""
     path = [str(part) for part in item["loc"]]
     if path and path[-1] == "[key]":
-        return [Fault(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "key-name")]
+        return [Issue(f"{where}: key '{'.'.join(path[:-1])}': {NAME_RULE}", "option-format")]
     key = ".".join(path)
     if item["type"] == "extra_forbidden":
         known = _keys_beside(model, path[:-1])
         hint = f"{nearest_name(path[-1], known)}; known here: {', '.join(sorted(known))}"
-        return [Fault(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
+        return [Issue(f"{where}: unknown key '{key}'{hint}", "key-unknown")]
     if item["type"] == "missing":
-        return [Fault(f"{where}: key '{key}' is missing", "key-missing")]
+        return [Issue(f"{where}: key '{key}' is missing", "key-missing")]
     words = item["msg"].removeprefix("Value error, ")
     if item["type"] == "model_type":
         words = f"a table is wanted here, with keys among {', '.join(_keys_beside(model, path))}"
     cause = item.get("ctx", {}).get("error")
     if isinstance(cause, KeyFaults):
-        return [
-            Fault(
-                f"{where}: key '{'.'.join([*path, name])}' = {_shown(v)}: {text}",
-                getattr(text, "code", "keys-conflict"),
-            )
-            for name, v, text in cause.faults
-        ]
+        out = []
+        for name, value, text in cause.faults:
+            at = f"'{'.'.join([*path, name])}' = {_shown(value)}" if name else f"'{key}'"
+            out.append(Issue(f"{where}: key {at}: {text}", getattr(text, "code", "keys-conflict")))
+        return out
     if isinstance(item["input"], (dict, BaseModel)):
-        return [Fault(f"{where}: key '{key}': {words}", "keys-conflict")]
-    return [Fault(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
+        return [Issue(f"{where}: key '{key}': {words}", "keys-conflict")]
+    return [Issue(f"{where}: key '{key}' = {_shown(item['input'])}: {words}", "key-value")]
 
 
 def _keys_beside(model: Any, path: list[str]) -> list[str]:
@@ -241,7 +256,7 @@ def parse_utc(text: str) -> datetime:
     return stamp.astimezone(UTC) if stamp.tzinfo else stamp.replace(tzinfo=UTC)
 
 
-def check_one_of(section: Section, first: str, second: str) -> None:
-    """Raise `ValueError` where a section states neither of two keys, or both."""
+def one_of(section: Section, first: str, second: str) -> Iterator[KeyFault]:
+    """Yield that a section states neither of two keys, or both."""
     if (getattr(section, first) is None) == (getattr(section, second) is None):
-        raise ValueError(f"either {first} or {second} is wanted, and not both")
+        yield "", None, f"either {first} or {second} is wanted, and not both"

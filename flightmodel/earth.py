@@ -113,7 +113,7 @@ def planet_from_j2000(t0_utc: str, time_s: FloatArray | float, planet: Planet) -
         raise GateError(
             'axes = "j2000" is known at Mars alone: the Earth\'s turn needs its orientation parameters; give '
             'axes = "fixed" or "inertial"',
-            "axes-unknown",
+            "planet-unsupported",
         )
     utc = parse_utc(t0_utc)
     jd = erfa.dtf2d("UTC", utc.year, utc.month, utc.day, utc.hour, utc.minute, utc.second + 1e-6 * utc.microsecond)

@@ -14,17 +14,18 @@ planetocentric and the horizontal is normal to the radius; with ``altitude_m`` b
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import Fault, FloatArray, GateError
-from flightmodel.config import Angle, Elevation, KeyFaults, Latitude, Longitude, Section, Time
+from flightmodel.checks import FloatArray, GateError, Issue
+from flightmodel.config import Angle, Elevation, KeyFault, Latitude, Longitude, Section, Time
 from flightmodel.gate import Gate
 from flightmodel.tables import Source
-from flightmodel.telemetry import Finding, StatedDrag, StatePrior, TriadRecord
+from flightmodel.telemetry import StatedDrag, StatePrior, TriadRecord
 
 Axes = Literal["fixed", "inertial", "j2000"]
 Triple = tuple[float, float, float]
@@ -77,25 +78,25 @@ class StateEntry(Section):
         stem, _, unit = key.rpartition("_")
         return f"{stem}_sd_{unit}"
 
-    @model_validator(mode="after")
-    def _one_form(self) -> StateEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         wanted = self._values
-        faults: list[tuple[str, object, str]] = []
         sds = tuple(map(self._sd_key, wanted))
         for key in type(self).model_fields:
             if key in ("t_s", "t_sd_s", "axes", "covariance"):
                 continue
             value = getattr(self, key)
             if key in wanted and value is None:
-                faults.append((key, None, "is missing: state position_m and velocity_mps, or radius_m or altitude_m "
-                               f"with {', '.join(_SPHERICAL)}"))  # fmt: skip
+                words = "is missing: state position_m and velocity_mps, or radius_m or altitude_m with "
+                words += ", ".join(_SPHERICAL)
+                yield key, None, words
             elif key in sds and (value is None) == (self.covariance is None):
-                faults.append((key, value, "state each standard deviation, or covariance instead of all of them"))
+                yield key, value, "state each standard deviation, or covariance instead of all of them"
             elif key not in (*wanted, *sds) and value is not None:
-                faults.append((key, value, f"does not go with {wanted[0]}; keep one form of the state"))
+                yield key, value, f"does not go with {wanted[0]}; keep one form of the state"
         if self.axes == "j2000" and wanted != _CARTESIAN:
             words = 'latitude and longitude are of the planet: axes = "fixed" or "inertial" says against what it moves'
-            faults.append(("axes", self.axes, words))
+            yield "axes", self.axes, words
         if self.covariance is not None:
             matrix = np.array(self.covariance)
             variance = np.diagonal(matrix)
@@ -103,11 +104,8 @@ class StateEntry(Section):
             unit = matrix / np.outer(scale, scale)
             if (variance <= 0.0).any() or not np.allclose(unit, unit.T, atol=1e-6) \
                     or np.linalg.eigvalsh(0.5 * (unit + unit.T))[0] < -1e-6:  # fmt: skip
-                words = Fault("a covariance is symmetric with positive eigenvalues", "covariance-impossible")
-                faults.append(("covariance", "...", words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+                words = Issue("a covariance is symmetric with positive eigenvalues", "argument-value")
+                yield "covariance", "...", words
 
     def prior(self, t0_utc: str, planet: earth.Planet) -> StatePrior:
         """State in planet-fixed axes, with its covariance."""
@@ -129,7 +127,7 @@ class StateEntry(Section):
                 f"its height above {name}'s ellipsoid is {height / 1000.0:.0f} km: radius_m is from {name}'s centre, "
                 "altitude_m from the ellipsoid, in metres; of an altitude above a sphere state radius_m, the sum"
             )
-            raise GateError(words, "state-height")
+            raise GateError(words, "value-range")
         step = 0.1 * np.sqrt(np.diagonal(covariance))
         moved = [
             self._fixed(stated + h, t0_utc, planet) - self._fixed(stated - h, t0_utc, planet) for h in np.diag(step)
@@ -190,17 +188,13 @@ class DragEntry(Section):
     mass_kg: Size
     mass_sd_percent: Percent = 0.0
 
-    @model_validator(mode="after")
-    def _one_of_two(self) -> DragEntry:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         for one, other in (("c_a", "table"), ("area_m2", "diameter_m")):
             if (getattr(self, one) is None) == (getattr(self, other) is None):
-                faults.append((one, getattr(self, one), f"state {one} or {other}, one of the two"))
+                yield one, getattr(self, one), f"state {one} or {other}, one of the two"
         if self.c_a_sd_percent == self.mass_sd_percent == 0.0:
-            faults.append(("c_a_sd_percent", 0.0, "no coefficient and mass are known exactly; state what they may err"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "c_a_sd_percent", 0.0, "no coefficient and mass are known exactly; state what they may err"
 
 
 def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
@@ -214,7 +208,7 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
         gate.refuse_rows(table, "c_a", 1e-6, 10.0, "no axial force coefficient")
         mach, c_a = table.columns["mach"], table.columns["c_a"]
         if len(gate.faults) == before and not (np.isfinite(mach + c_a).all() and (np.diff(mach) > 0.0).all()):
-            gate.refuse(f"drag.table: {table.path}: Mach numbers grow from row to row, without gaps", "mach-order")
+            gate.refuse(f"drag.table: {table.path}: Mach numbers grow from row to row, without gaps", "time-backwards")
         if len(gate.faults) > before:
             return None
     fast = (mach >= _SUPERSONIC) | (len(mach) == 1)
@@ -223,7 +217,7 @@ def read_drag(gate: Gate, entry: DragEntry) -> StatedDrag | None:
             f"C_A of {largest:.3g}: stagnation pressure on all of the frontal area gives {_MOST_C_A:g}; "
             "is area_m2 or diameter_m of the same reference as c_a?"
         )
-        gate.findings.append(Finding("drag", words, np.nan, np.nan, code="drag-large"))
+        gate.findings.append(Issue(words, "drag-large", "drag"))
     area = entry.area_m2 if entry.diameter_m is None else 0.25 * np.pi * entry.diameter_m**2
     assert area is not None
     sd = 0.01 * float(np.hypot(entry.c_a_sd_percent, entry.mass_sd_percent))
@@ -241,7 +235,7 @@ def refuse_misread_entry(gate: Gate, record: TriadRecord, state: StatePrior) -> 
         gate.refuse(
             f"{name}: readings from {record.time_s[0]:.6g} to {record.time_s[-1]:.6g} s, the state is of "
             f"{state.time_s:.6g} s: all times count from t0_utc; state offset_s of a spacecraft's clock, or its unit",
-            "times-apart",
+            "time-not-covered",
         )
     axial = record.spec.dcm_body_sensor[0]
     used = np.abs(axial) > 1e-9

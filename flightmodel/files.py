@@ -26,7 +26,7 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
-from flightmodel.checks import NO_FAULT, Fault, GateError
+from flightmodel.checks import NO_FAULT, GateError, Issue
 
 TABLE_BYTES = 2 * 1024**3  # of text; the careful reader takes ten times that of memory
 PICTURE_BYTES = 256 * 1024**2  # 40 million pixels of three colours, 16 bit each, uncompressed
@@ -49,7 +49,7 @@ NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 class UnfitFile(OSError):
     """A file that is not opened; ``strerror`` says why, ``code`` is ``not-a-file`` or ``file-too-large``."""
 
-    def __init__(self, path: Path, fault: Fault) -> None:
+    def __init__(self, path: Path, fault: Issue) -> None:
         super().__init__(None, str(fault), str(path))
         self.code = fault.code
 
@@ -81,26 +81,26 @@ def file_bytes(path: Path, most_bytes: int = TABLE_BYTES) -> bytes:
     return content
 
 
-def unfit(path: Path, most_bytes: int) -> Fault:
+def unfit(path: Path, most_bytes: int) -> Issue:
     """Say why `open_file` would not open a path; empty where it would."""
     try:
         _check(path, path.stat(), most_bytes)
     except UnfitFile as fault:
-        return Fault(str(fault.strerror), fault.code)
+        return Issue(str(fault.strerror), fault.code)
     except OSError:
-        return Fault("no such file", "file-missing")
+        return Issue("no such file", "file-missing")
     return NO_FAULT
 
 
-def nothing_at(path: Path) -> Fault:
+def nothing_at(path: Path) -> Issue:
     """Say that there is no such file, and what there is in its place."""
     folder = path.parent
     try:
         there = sorted(p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
     except OSError:
-        return Fault(f"no such file: there is no folder {folder}", "file-missing")
+        return Issue(f"no such file: there is no folder {folder}", "file-missing")
     listed = ", ".join(there[:MOST_LISTED]) + (", ..." if len(there) > MOST_LISTED else "")
-    return Fault(f"no such file; there are: {listed or 'none'}", "file-missing")
+    return Issue(f"no such file; there are: {listed or 'none'}", "file-missing")
 
 
 def leads_outside(folder: Path, named: str) -> bool:
@@ -113,13 +113,13 @@ def _check(path: Path, known: os.stat_result, most_bytes: int) -> None:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(known.st_mode):
         kind = _KINDS.get(stat.S_IFMT(known.st_mode), "no file")
-        raise UnfitFile(path, Fault(f"is {kind}; a file is wanted", "not-a-file"))
+        raise UnfitFile(path, Issue(f"is {kind}; a file is wanted", "not-a-file"))
     if known.st_size > most_bytes:
         raise UnfitFile(path, _too_large(known.st_size, most_bytes))
 
 
-def _too_large(size: int, most_bytes: int) -> Fault:
-    return Fault(f"has {size} bytes where {most_bytes} at most are read; split it or thin it out", "file-too-large")
+def _too_large(size: int, most_bytes: int) -> Issue:
+    return Issue(f"has {size} bytes where {most_bytes} at most are read; split it or thin it out", "file-too-large")
 
 
 @contextmanager

@@ -41,7 +41,7 @@ import PIL.Image
 from numpy.typing import NDArray
 
 from flightmodel.camera_edits import NO_EDITS, CameraEdits
-from flightmodel.checks import NO_FAULT, BoolArray, Fault, FloatArray
+from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, Issue
 from flightmodel.files import PICTURE_BYTES, unfit
 from flightmodel.vehicle import CameraMount
 
@@ -195,7 +195,7 @@ def _grey(picture: NDArray[np.uint8]) -> Image:
     return picture
 
 
-def film_timing_fault(path: Path) -> Fault:
+def film_timing_fault(path: Path) -> Issue:
     """Say why frame numbers of a film may be off; empty where every frame that it counts can be decoded.
 
     A frame that cannot be decoded is stepped over without a word, and every later one then has a number less. What
@@ -215,7 +215,7 @@ def film_timing_fault(path: Path) -> Fault:
     remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
     if counts > 0 and not (len(times) >= counts - 1 if estimated else len(times) == counts):
         words = f"{len(times)} frames can be decoded where the film's own count is {counts}"
-        return Fault(f"{words}: is the file whole? If it is, {remedy}", "film-count")
+        return Issue(f"{words}: is the file whole? If it is, {remedy}", "film-count")
     if len(times) < 3:
         return NO_FAULT
     step = np.diff(times)
@@ -223,23 +223,23 @@ def film_timing_fault(path: Path) -> Fault:
     uneven = np.flatnonzero(np.abs(step - np.median(step)) > 0.5 * np.median(step))
     if len(uneven):
         where = f"{1e-3 * times[uneven[0]]:.3f} s into the film, before its frame {uneven[0]}"
-        return Fault(
+        return Issue(
             f"time jumps {where} ({len(uneven)} such jumps): a frame lost or an uneven rate; {remedy}", "film-rate"
         )
     return NO_FAULT
 
 
-def start_fault(path: Path) -> Fault:
+def start_fault(path: Path) -> Issue:
     """Say why a file is no film by its first bytes; empty where they are a film's."""
     if fault := unfit(path, sys.maxsize):  # it is decoded frame by frame
         return fault
     if path.stat().st_size == 0:
-        return Fault("is empty", "file-empty")
+        return Issue("is empty", "file-unreadable")
     with path.open("rb") as file:
         start = file.read(12)
     # by content: a list of other places to play from would be opened too
     if not (start[:4] == WEBM_START or start[4:8] == b"ftyp" or (start[:4] == b"RIFF" and start[8:12] == b"AVI ")):
-        return Fault(UNKNOWN_FILM, "film-unreadable")
+        return Issue(UNKNOWN_FILM, "file-unreadable")
     return NO_FAULT
 
 
@@ -250,17 +250,17 @@ def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
     film = cv2.VideoCapture(str(path))
     try:
         if not film.isOpened():
-            return Fault(
-                f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)", "film-unreadable"
+            return Issue(
+                f"{UNKNOWN_FILM}; if it is one, it is cut off (an .mp4 has its index at its end)", "file-unreadable"
             )
         width, height = (round(film.get(key)) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         if (width, height) != size_px:
-            return Fault(f"is {width} x {height} pixels, the camera {size_px[0]} x {size_px[1]}", "image-size")
+            return Issue(f"is {width} x {height} pixels, the camera {size_px[0]} x {size_px[1]}", "frame-size")
         count = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
         if 0 < count <= last_number:
-            return Fault(f"has {count} frames; the list asks for frame {last_number} (the first is 0)", "frame-missing")
+            return Issue(f"has {count} frames; the list asks for frame {last_number} (the first is 0)", "frame-missing")
         if not film.grab():
-            return Fault("holds no frame that can be decoded", "film-unreadable")
+            return Issue("holds no frame that can be decoded", "file-unreadable")
     finally:
         film.release()
     return ""
@@ -279,16 +279,16 @@ def image_fault(path: Path, size_px: tuple[int, int]) -> str:
             with PIL.Image.open(path, formats=PICTURE_KINDS) as head:
                 size = head.size
     except (PIL.Image.DecompressionBombWarning, PIL.Image.DecompressionBombError):
-        return Fault(f"has far more pixels than the camera's {size_px[0]} x {size_px[1]}", "image-size")
+        return Issue(f"has far more pixels than the camera's {size_px[0]} x {size_px[1]}", "frame-size")
     except (OSError, ValueError, SyntaxError):
-        return Fault(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "image-unreadable")
+        return Issue(f"cannot be decoded as an image (known are {', '.join(PICTURE_KINDS)})", "file-unreadable")
     if sorted(size) == sorted(size_px) and not _is_whole_png(path):  # a rotated JPEG has that in its metadata
         height, width = read_image(path).shape
         if height == 0:
-            return Fault("cannot be decoded as an image", "image-unreadable")
+            return Issue("cannot be decoded as an image", "file-unreadable")
         size = (width, height)
     if size != size_px:
-        return Fault(f"is {size[0]} x {size[1]} pixels, the camera {size_px[0]} x {size_px[1]}", "image-size")
+        return Issue(f"is {size[0]} x {size[1]} pixels, the camera {size_px[0]} x {size_px[1]}", "frame-size")
     return ""
 
 

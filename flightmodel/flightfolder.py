@@ -9,22 +9,22 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import (
     Angle,
     Duration,
     Elevation,
-    KeyFaults,
+    KeyFault,
     Label,
     Latitude,
     Longitude,
@@ -76,7 +76,6 @@ from flightmodel.tables import GNSS_SD, Source, Spans
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
-    Finding,
     GnssRecord,
     KnownPlace,
     Motion,
@@ -132,17 +131,16 @@ class AttitudeEntry(Section):
             return (float(value),) * 3
         return value
 
-    @model_validator(mode="after")
-    def _one_form(self) -> AttitudeEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
-            raise ValueError("q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place")
-        if self.q_ecef_body is None and any(v is None for v in pointing):
-            raise ValueError("write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis")
-        if (place[0] is None) != (place[1] is None):
-            raise ValueError("latitude_deg and longitude_deg belong together")
-        return self
+            yield "", None, "q_ecef_body is whole; remove azimuth_deg, elevation_deg, roll_deg and the place"
+        elif self.q_ecef_body is None and any(v is None for v in pointing):
+            yield "", None, "write q_ecef_body, or azimuth_deg, elevation_deg and roll_deg of the body's x axis"
+        elif (place[0] is None) != (place[1] is None):
+            yield "", None, "latitude_deg and longitude_deg belong together"
 
 
 class StartEntry(Section):
@@ -154,15 +152,14 @@ class StartEntry(Section):
     azimuth_sd_deg: Annotated[float, Field(ge=1e-3, le=180.0)] = 2.0
     state: StateEntry | None = None
 
-    @model_validator(mode="after")
-    def _ordered(self) -> StartEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
-            raise KeyFaults([("at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s")])
+            yield "at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s"
         if self.at_rest is None and self.azimuth_deg is not None:
-            raise KeyFaults([("azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too")])
+            yield "azimuth_deg", self.azimuth_deg, "counts where at_rest = [from, to] is stated too"
         if self.at_rest is not None and self.state is not None:
-            raise KeyFaults([("state", "...", "a start at rest has its own state; keep at_rest or state")])
-        return self
+            yield "state", "...", "a start at rest has its own state; keep at_rest or state"
 
 
 class PlaceEntry(Section):
@@ -185,13 +182,12 @@ class UnmodelledEntry(Section):
     sd_mps2: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
-    @model_validator(mode="after")
-    def _something(self) -> UnmodelledEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.from_s < self.to_s:
-            raise KeyFaults([("to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s")])
+            yield "to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s"
         if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
-            raise KeyFaults([("sd_mps2", 0.0, "state sd_mps2, sd_degps or both")])
-        return self
+            yield "sd_mps2", 0.0, "state sd_mps2, sd_degps or both"
 
 
 class MotionEntry(Section):
@@ -294,60 +290,54 @@ class FlightFile(Section):
         single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
-    def misfits(self, needs_path: bool = True) -> list[Fault]:
-        """Return what does not go together, each with what to write instead.
+    def misfits(self, needs_path: bool = True) -> Iterator[Issue]:
+        """Yield what does not go together, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
         """
-        out = self._misfits_of_planet()
+        yield from self._misfits_of_planet()
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
-            out.append(Fault(words, "drag-twice"))
+            yield Issue(words, "keys-conflict")
         if needs_path or self.radars or self.gnss or not self.films:
-            out += self._misfits_of_path()
+            yield from self._misfits_of_path()
         if self.films and self.vehicle is None:
             tables = ", ".join(self.films)
-            out.append(
-                Fault(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
-            )
+            yield Issue(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
-            out.append(Fault(words, "frames-twice"))
+            yield Issue(words, "keys-conflict")
         names = [*self.radars, *self.gnss, *self.barometers, *_TAKEN]
         for name in sorted({n for n in names if names.count(n) > 1}):
             words = f"the name '{name}' stands in more than one of radars, gnss and barometers; results go by name"
             if name in _TAKEN:
                 words = f"the name '{name}' stands for {_TAKEN[name]}; call the tracker otherwise"
-            out.append(Fault(words, "name-twice"))
-        return out
+            yield Issue(words, "given-twice")
 
-    def _misfits_of_planet(self) -> list[Fault]:
-        """Return what is known of the Earth alone."""
-        out: list[Fault] = []
+    def _misfits_of_planet(self) -> Iterator[Issue]:
+        """Yield what is known of the Earth alone."""
         if self.body == WGS84:
-            return out
+            return
         where = f'planet = "{self.planet}"'
         if self.sensors.magnetometer is not None:
-            out.append(Fault(f"[sensors.magnetometer]: {where} has no field model; take it out", "field-unknown"))
+            yield Issue(f"[sensors.magnetometer]: {where} has no field model; take it out", "planet-unsupported")
         if self.sensors.sun is not None:
             words = "the Sun's direction is known from the Earth alone; take it out and state [attitude_prior]"
-            out.append(Fault(f"[sensors.sun]: {where}: {words}", "sun-unknown"))
+            yield Issue(f"[sensors.sun]: {where}: {words}", "planet-unsupported")
         for table, entries in (("gnss", self.gnss), ("barometers", self.barometers)):
             for name, entry in entries.items():
                 if entry.height_is == "msl" and entry.geoid_undulation_m is None:
                     words = 'state geoid_undulation_m, or heights above the ellipsoid (height_is = "ellipsoid")'
-                    out.append(Fault(f"{table}.{name}: {where} has no geoid here; {words}", "geoid-unknown"))
+                    yield Issue(f"{table}.{name}: {where} has no geoid here; {words}", "planet-unsupported")
         if self.start.at_rest is not None:
             words = "a rest is levelled by the Earth's gravity and turn; state [start.state]"
-            out.append(Fault(f"start.at_rest: {where}: {words}", "rest-unknown"))
-        return out
+            yield Issue(f"start.at_rest: {where}: {words}", "planet-unsupported")
 
-    def _misfits_of_drag(self) -> list[Fault]:
-        """Return what ballistic flight and an accelerometer without gyros lack."""
-        out = []
+    def _misfits_of_drag(self) -> Iterator[Issue]:
+        """Yield what ballistic flight and an accelerometer without gyros lack."""
         if self.motion.model == "ballistic" and self.motion.drag_area_per_mass_m2pkg is None and self.drag is None:
             words = "needs drag_area_per_mass_m2pkg, C_D S / m to a factor of exp(drag_sd), or [drag]"
-            out.append(Fault(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict"))
+            yield Issue(f"key 'motion.model' = 'ballistic': {words}", "keys-conflict")
         entry = self.sensors.accelerometer
         if entry is not None and self.measures_deceleration and entry.mount in (None, "body"):
             axial = entry.dcm_body_sensor[0]
@@ -356,42 +346,40 @@ class FlightFile(Section):
                 words = (
                     f"its {unread[0]} lies along body x, where the deceleration is; add it to measures, or state axes"
                 )
-                out.append(Fault(f"sensors.accelerometer: {words}", "axial-missing"))
+                yield Issue(f"sensors.accelerometer: {words}", "input-missing")
         elif entry is not None and len(set(entry.measures)) < 3 and self.motion.model == "strapdown":
             words = 'measures: three axes carry a state; with fewer write model = "ballistic" in [motion]'
-            out.append(Fault(f"sensors.accelerometer.{words}", "inertial-missing"))
-        return out
+            yield Issue(f"sensors.accelerometer.{words}", "inertial-missing")
 
-    def _misfits_of_path(self) -> list[Fault]:
-        """Return what keeps a path from being found."""
-        out = self._misfits_of_drag()
+    def _misfits_of_path(self) -> Iterator[Issue]:
+        """Yield what keeps a path from being found."""
+        yield from self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
         if not self.radars and not self.gnss and self.start.state is None:
             also = "; a barometer alone gives no place" if self.barometers else ""
             words = (
                 f"no [radars.NAME] and no [gnss.NAME]: a trajectory needs at least one of them, or [start.state]{also}"
             )
-            out.append(Fault(words, "tracker-missing"))
+            yield Issue(words, "tracker-missing")
         if len(triads) == 1 and not self.measures_deceleration:
             other = "rates" if triads == ["accelerometer"] else "accelerometer"
             words = f"[sensors.{triads[0]}] without [sensors.{other}]: only both together carry a state; add the other"
             if triads == ["accelerometer"]:
                 words += ', or write model = "ballistic" in [motion], where an accelerometer measures the drag'
-            out.append(Fault(words, "inertial-missing"))
+            yield Issue(words, "inertial-missing")
         if self.motion.model == "strapdown" and not triads:
             words = (
                 'needs [sensors.accelerometer] and [sensors.rates]; without them write model = "ballistic" in [motion]'
             )
-            out.append(Fault(f'motion.model = "strapdown" {words}', "inertial-missing"))
+            yield Issue(f'motion.model = "strapdown" {words}', "inertial-missing")
         attitude = self.attitude_prior or self.start.at_rest or (self.sensors.magnetometer and self.sensors.sun)
         if self.start.at_rest and (self.motion.model != "strapdown" or len(triads) < 2):
             words = "start.at_rest: a rest is measured by accelerometer and gyros, which do not carry this flight"
-            out.append(Fault(f"{words}; take [start] out", "rest-without-inertial"))
+            yield Issue(f"{words}; take [start] out", "keys-conflict")
         if self.motion.model == "strapdown" and not attitude:
             words = "write [attitude_prior] (a quaternion, or azimuth_deg, elevation_deg and roll_deg)"
             words = f"no initial attitude: {words}, [start] at_rest, or both [sensors.magnetometer] and [sensors.sun]"
-            out.append(Fault(words, "attitude-missing"))
-        return out
+            yield Issue(words, "attitude-missing")
 
 
 def read_flight_file(folder: Path) -> FlightFile:
@@ -399,7 +387,7 @@ def read_flight_file(folder: Path) -> FlightFile:
     path = folder / "flight.toml"
     if not folder.is_dir():
         words = f"is a file; its folder is wanted: {folder.parent}" if folder.is_file() else "no such flight folder"
-        raise ConfigError(f"{folder}: {words}", code="folder-missing")
+        raise ConfigError(f"{folder}: {words}", code="file-missing")
     return read_section(FlightFile, path)
 
 
@@ -466,7 +454,7 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
             'accelerometer and rates are there, but with model = "ballistic" gravitation and drag carry the flight: '
             "they are not used for its path and attitude; take [motion] out unless that is meant"
         )
-        gate.findings.append(Finding("motion", words, np.nan, np.nan, code="inertial-unused"))
+        gate.findings.append(Issue(words, "inertial-unused", "motion"))
     measured = spec.atmosphere is not None
     place = _first_place(radars, gnss, spec.body, state)
     barometers = {
@@ -532,7 +520,8 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         kinds = (("radars", found.radars), ("receivers", found.gnss), ("start", found.state))
         trackers = " and ".join(kind for kind, some in kinds if some)
         raise GateError(
-            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)", code="no-common-time"
+            f"{folder}: {who} {trackers} have no second in common ({start:.2f} to {stop:.2f} s)",
+            code="time-not-covered",
         )
     return telemetry
 
@@ -560,18 +549,18 @@ def _vehicle(gate: Gate, name: str, events: list[EventEntry]) -> Vehicle | None:
     try:
         path = vehicle_path(name, gate.folder)
         if gate.is_truth(path):
-            raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-in-truth")
+            raise ConfigError(f"{path} lies in truth/, which no estimator may open", code="path-refused")
         vehicle = vehicle_from_toml(path).with_events((event.name, event.t_s) for event in events)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"vehicle: {each}", each.code))
+            gate.refuse_config(Issue(f"vehicle: {each}", each.code))
         return None
     for body, mesh in vehicle.meshes.items():
-        use, code = "the camera's fit is of its edge and surface", "mesh-fitted"
+        use, code = "the camera's fit is of its edge and surface", "mesh-use"
         if body == "centerbody":
-            use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-drawn"
-        code = "mesh-apart" if mesh.apart else code
-        gate.findings.append(Finding(f"mesh of the {body}", f"{mesh.words}; {use}", np.nan, np.nan, code))
+            use, code = "it is drawn, while the camera's view is bounded by [geometry]", "mesh-use"
+        code = "mesh-use" if mesh.apart else code
+        gate.findings.append(Issue(f"{mesh.words}; {use}", code, f"mesh of the {body}"))
     return vehicle
 
 
@@ -590,13 +579,13 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
         return read_sounding(gate, spec.atmosphere, spec.body)
     if spec.body != WGS84:
         words = f"no [atmosphere]: the standard atmosphere of {spec.planet.capitalize()} without wind stands for it"
-        gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+        gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
         return standard_sounding(spec.body)
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 stands for it, density to 10 % (24 % from 80 km), "
         "wind to 15 m/s"
     )
-    gate.findings.append(Finding("atmosphere", words, np.nan, np.nan, code="no-sounding"))
+    gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
     return standard_sounding()
 
 
@@ -607,7 +596,7 @@ def _attitude_prior(gate: Gate, entry: AttitudeEntry, place: tuple[float, float]
         q = np.array(entry.q_ecef_body)
         norm = float(np.linalg.norm(q))
         if abs(norm - 1.0) > 1e-3:
-            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "quaternion-norm")
+            gate.refuse_config(f"attitude_prior.q_ecef_body has norm {norm:.4f}, not 1", "value-range")
             return None
         return AttitudePrior(entry.t_s, q / norm, sd)
     if entry.latitude_deg is not None and entry.longitude_deg is not None:
@@ -632,7 +621,7 @@ def _state(gate: Gate, spec: FlightFile) -> StatePrior | None:
         return spec.start.state.prior(spec.t0_utc, spec.body)
     except GateError as fault:
         for each in fault.faults:
-            gate.refuse_config(Fault(f"start.state: {each}", each.code))
+            gate.refuse_config(Issue(f"start.state: {each}", each.code))
         return None
 
 
@@ -641,7 +630,7 @@ def _start(entry: StartEntry) -> Start:
     return Start(entry.at_rest, entry.sd_mps, azimuth, float(np.deg2rad(entry.azimuth_sd_deg)))
 
 
-def _rest_findings(telemetry: Telemetry) -> list[Finding]:
+def _rest_findings(telemetry: Telemetry) -> list[Issue]:
     """A rest that the data begin with and flight.toml does not state."""
     if telemetry.motion.model != "strapdown" or telemetry.start.at_rest is not None:
         return []
@@ -655,13 +644,13 @@ def _rest_findings(telemetry: Telemetry) -> list[Finding]:
         f"the vehicle stands still: write [start] at_rest = [{span[0]:.2f}, {span[1]:.2f}], which levels it and frees "
         f"its velocity of the trackers; noise there: {noise[0]:.2g} m/s2, {np.rad2deg(noise[1]):.2g} deg/s"
     )
-    out = [Finding("start", words, *span, code="rest-found")]
+    out = [Issue(words, "rest-found", "start", *span)]
     rates = telemetry.rates
     turning = float(np.abs(mean_readings(rates, span).mean).max()) - telemetry.planet.rate_radps
     times = turning / max(rates.spec.bias_sd, 1e-12)
     if times > _BIAS_TIMES:
         words = f"at rest it reads {times:.0f} times bias_sd_degps: no track can be followed; state it wider"
-        out.append(Finding(rates.spec.name, words, *span, code="bias-beyond-data-sheet"))
+        out.append(Issue(words, "bias-beyond-data-sheet", rates.spec.name, *span))
     return out
 
 

@@ -30,10 +30,9 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import tables
-from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import NO_FAULT, BoolArray, ConfigError, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.csv_reading import file_sha256, read_numbers
 from flightmodel.tables import Source, ThinnedSpan, spaced, spacing_s
-from flightmodel.telemetry import Finding
 
 MOST_PAUSE_S = 86400.0  # no vehicle is in flight, or on its pad, for a day without a reading
 # no entry vehicle's instruments read beyond these; a larger number is a wrong unit or a broken word
@@ -79,9 +78,9 @@ class Gate:
 
     folder: Path
     t0: datetime
-    faults: list[str] = field(default_factory=list)
-    config: list[str] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
+    faults: list[Issue] = field(default_factory=list)
+    config: list[Issue] = field(default_factory=list)
+    findings: list[Issue] = field(default_factory=list)
     digests: dict[Path, str] = field(default_factory=dict)
     progress: Callable[[int], None] = lambda _bytes: None  # called with the bytes read since the last call
 
@@ -91,12 +90,12 @@ class Gate:
 
     def refuse(self, words: str, code: str) -> None:
         """Keep a fault of the data."""
-        self.faults.append(Fault(words, code))
+        self.faults.append(Issue(words, code))
 
     def refuse_config(self, words: str, code: str = "") -> None:
         """Keep a fault of flight.toml."""
         code = code or getattr(words, "code", "")
-        self.config.append(Fault(f"{self.folder / 'flight.toml'}: {words}", code))
+        self.config.append(Issue(f"{self.folder / 'flight.toml'}: {words}", code))
 
     def close(self) -> None:
         """Raise `ConfigError` or `GateError` with everything that was refused."""
@@ -108,12 +107,12 @@ class Gate:
     def wrong_place(self, path: Path, named: str) -> str:
         """Return why a named file may not be read: outside the folder, or below its truth; empty where it may."""
         if "\0" in named:
-            return Fault(f"file {named!r}: a path holds no NUL character", "path-nul")
+            return Issue(f"file {named!r}: a path holds no NUL character", "path-refused")
         if Path(named).is_absolute() or not path.resolve().is_relative_to(self.folder.resolve()):
             words = f"file '{named}' lies outside the flight folder; copy it inside and name it relative to flight.toml"
-            return Fault(words, "path-outside-folder")
+            return Issue(words, "path-refused")
         if self.is_truth(path):
-            return Fault(f"file '{named}' lies in truth/, which no estimator may open", "path-in-truth")
+            return Issue(f"file '{named}' lies in truth/, which no estimator may open", "path-refused")
         return ""
 
     def is_truth(self, path: Path) -> bool:
@@ -149,7 +148,7 @@ class Gate:
         shorts = [q.short for q in quantities]
         for key in (k for k in source.columns if k not in shorts):
             hint = nearest_name(key, shorts)
-            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}", "quantity-unknown")
+            self.refuse_config(f"{label}.columns.{key}: no such quantity{hint}", "name-unknown")
         path = self.path(source.file)
         if path is None:
             return None
@@ -192,6 +191,8 @@ class Gate:
                 return None
         self.digests[path] = found.sha256
         held = {short: place for short, place in places.items() if place[0] in found.columns}
+        if not held:
+            return None
         values = {short: tables.to_si(found.columns[column], unit) for short, (column, unit) in held.items()}
         rows = len(next(iter(values.values())))
         return time_s, values, found.first_line + np.arange(rows)
@@ -224,7 +225,7 @@ class Gate:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
             self.refuse(
                 f"{table.label}: {table.path}: use_s leaves {rows.sum()} rows of {span}; two are needed",
-                "use-span-empty",
+                "too-few-rows",
             )
         return table.of_rows(rows)
 
@@ -238,7 +239,7 @@ class Gate:
         if delivery.refusal or not delivery.repairs:
             return table
         source = table.label.partition(".")[2] or table.label
-        self.findings.extend(replace(repair, source=source) for repair in delivery.repairs)
+        self.findings.extend(Issue(repair, "", source, repair.start_s, repair.end_s) for repair in delivery.repairs)
         rows = delivery.rows
         held = {short: column[rows] for short, column in table.columns.items()}
         return Table(table.path, table.label, table.time_s[rows], held, table.lines[rows])
@@ -282,7 +283,7 @@ MANY = 20  # runs of one kind that are listed one by one
 
 def find_faults(
     source: str, time_s: FloatArray, names: tuple[str, ...], values: FloatArray, missing: BoolArray | None = None
-) -> list[Finding]:
+) -> list[Issue]:
     """Findings of one sensor.
 
     Parameters
@@ -301,12 +302,12 @@ def find_faults(
     step = np.diff(time_s)
     wide = np.flatnonzero(step > GAP_FACTOR * float(np.median(step)))
     found = findings_of_runs(
-        source, time_s, wide, wide + 1, lambda k: Fault(f"gap of {step[wide[k]]:.3f} s", "data-gap"), "gaps"
+        source, time_s, wide, wide + 1, lambda k: Issue(f"gap of {step[wide[k]]:.3f} s", "data-gap"), "gaps"
     )
     first, last = runs(missing)
     found += findings_of_runs(
         source, time_s, first, last,
-        lambda k: Fault(f"{last[k] - first[k] + 1} samples missing", "samples-missing"), "missing runs",
+        lambda k: Issue(f"{last[k] - first[k] + 1} samples missing", "samples-missing"), "missing runs",
     )  # fmt: skip
     for name, column in zip(names, values.T, strict=True):
         found += _stuck(source, time_s, name, column)
@@ -314,8 +315,8 @@ def find_faults(
 
 
 def findings_of_runs(
-    source: str, time_s: FloatArray, first: IntArray, last: IntArray, words: Callable[[int], Fault], kind: str
-) -> list[Finding]:
+    source: str, time_s: FloatArray, first: IntArray, last: IntArray, words: Callable[[int], Issue], kind: str
+) -> list[Issue]:
     """Findings of runs of samples ``first`` to ``last``; ``words`` of each with their code, and ``kind`` in the plural.
 
     Of very many the longest are listed one by one and the others together.
@@ -327,12 +328,12 @@ def findings_of_runs(
         alone = size > least
         alone[np.flatnonzero(size == least)[: MANY - int(alone.sum())]] = True
     chosen = np.flatnonzero(alone).tolist()
-    found = [Finding(source, words(k), float(time_s[first[k]]), float(time_s[last[k]]), words(k).code) for k in chosen]
+    found = [Issue(words(k), words(k).code, source, float(time_s[first[k]]), float(time_s[last[k]])) for k in chosen]
     if not alone.all():
         size, first, last = size[~alone], first[~alone], last[~alone]
         together = f"{len(size)} further {kind}, {size.sum()} samples, at most {size.max()} in a row"
         code = words(int(np.flatnonzero(~alone)[0])).code
-        found.append(Finding(source, together, float(time_s[first[0]]), float(time_s[last[-1]]), code))
+        found.append(Issue(together, code, source, float(time_s[first[0]]), float(time_s[last[-1]])))
     return found
 
 
@@ -345,7 +346,7 @@ def runs(mask: BoolArray) -> tuple[IntArray, IntArray]:
     return inside[np.append(0, breaks + 1)], inside[np.append(breaks, len(inside) - 1)]
 
 
-def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> list[Finding]:
+def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> list[Issue]:
     """Runs of one value: long ones anywhere, shorter ones at the column's largest and smallest value."""
     # NaN is equal to nothing; a run of "equal to the sample before" begins one sample earlier
     first, last = runs(column[1:] == column[:-1])
@@ -359,12 +360,12 @@ def _stuck(source: str, time_s: FloatArray, name: str, column: FloatArray) -> li
     some = saturated | frozen
     first, last, saturated, frozen = first[some], last[some], saturated[some], frozen[some]
 
-    def words(k: int) -> Fault:
+    def words(k: int) -> Issue:
         # a long run at an extreme may be either: a stop reached, or a sensor that stuck there
         both = saturated[k] and frozen[k]
         what = "frozen or saturated" if both else "frozen" if frozen[k] else "saturated"
         text = f"{name} {what} at {column[first[k]]:.6g} (SI) for {last[k] - first[k] + 1} samples"
-        return Fault(text, f"data-{what.replace(' ', '-')}")
+        return Issue(text, f"data-{what.replace(' ', '-')}")
 
     return findings_of_runs(source, time_s, first, last, words, f"runs of one value of {name}")
 
@@ -384,15 +385,15 @@ class Delivery:
     ----------
     rows : (k,) int
         Rows to use, in order of time.
-    repairs : tuple of Finding
+    repairs : tuple of Issue
         What was done, from which to which time; their source is left open.
-    refusal : Fault
+    refusal : Issue
         Why the table cannot be used; empty where it can.
     """
 
     rows: IntArray
-    repairs: tuple[Finding, ...] = ()
-    refusal: Fault = NO_FAULT
+    repairs: tuple[Issue, ...] = ()
+    refusal: Issue = NO_FAULT
 
 
 def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> Delivery:
@@ -423,13 +424,13 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
         return Delivery(everything, refusal=_refusal_of_clock(time_s, lines, row, contradicting))
     late = np.setdiff1d(late, squeezed)
     repairs = (
-        (again, "repeat earlier rows: left out", "rows-repeated"),
+        (again, "repeat earlier rows: left out", "rows-left-out"),
         (late, "came late or out of order: put in order", "rows-reordered"),
         (torn, f"give different values for one time ({_times(time_s, torn)}): none of them is used", "rows-contradict"),
-        (squeezed, "came late where earlier rows leave no room: not used", "rows-no-room"),
+        (squeezed, "came late where earlier rows leave no room: not used", "rows-contradict"),
     )
     findings = tuple(
-        Finding("", f"{_blocks(k)} {words}", float(time_s[k].min()), float(time_s[k].max()), code)
+        Issue(f"{_blocks(k)} {words}", code, "", float(time_s[k].min()), float(time_s[k].max()))
         for k, words, code in repairs
         if len(k)
     )
@@ -438,16 +439,11 @@ def in_order(time_s: FloatArray, values: list[FloatArray], lines: IntArray) -> D
 
 def _of_one_time(time_s: FloatArray, values: list[FloatArray]) -> tuple[IntArray, IntArray]:
     """Rows that repeat an earlier one, and all rows of the times at which rows differ; both as delivered."""
-    order = np.argsort(time_s, kind="stable")
-    same = np.diff(time_s[order]) == 0.0
-    equal = same.copy()
-    for column in values:
-        one, other = column[order[:-1][equal]], column[order[1:][equal]]
-        equal[equal] = (one == other) | (np.isnan(one) & np.isnan(other))
-    instant = np.append(0, np.cumsum(~same))
-    torn = np.isin(instant, instant[1:][same & ~equal])
-    again = np.append(False, same) & ~torn
-    return np.sort(order[again]), np.sort(order[torn])
+    rows = pd.DataFrame(np.column_stack([time_s, *values]))
+    again = rows.duplicated()
+    times = rows.loc[~again, 0]
+    torn = rows[0].isin(times[times.duplicated()])
+    return np.flatnonzero(again & ~torn), np.flatnonzero(torn)
 
 
 def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArray:
@@ -498,14 +494,14 @@ def _neighbours_that_came_before(times: FloatArray) -> tuple[IntArray, IntArray]
     return before, after
 
 
-def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> Fault:
+def _refusal_of_clock(time_s: FloatArray, lines: IntArray, row: int, contradicting: IntArray) -> Issue:
     """Why a table is refused whose clock was set back in ``row``."""
     later = contradicting[contradicting >= row]
     words = (
         f"{_backwards(time_s, lines, row)}, and the rows run on from there as after a reset clock ({len(later)} of "
         f"them contradict earlier ones, all later ones may have wrong times); {REMEDY}"
     )
-    return Fault(words, "clock-set-back")
+    return Issue(words, "clock-set-back")
 
 
 def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
@@ -513,21 +509,21 @@ def _backwards(time_s: FloatArray, lines: IntArray, row: int) -> str:
     return f"line {int(lines[row])}: time runs backwards or repeats: {step}"
 
 
-def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> Fault:
+def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArray, squeezed: IntArray) -> Issue:
     """Why the table is refused, with the first line at fault."""
     if len(torn) and len(torn) >= len(squeezed):
         instants, first = np.unique(time_s[torn], return_index=True)
         row = int(np.setdiff1d(torn, torn[first])[0])
         other = int(torn[first[np.searchsorted(instants, time_s[row])]])
         words = f"with other values than in line {int(lines[other])} ({len(torn)} such rows in all)"
-        return Fault(f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}", "rows-contradict")
+        return Issue(f"{_backwards(time_s, lines, row)}, {words}; {REMEDY}", "rows-contradict")
     if len(squeezed):
         words = f"where earlier rows leave no room ({len(squeezed)} such rows in all)"
-        return Fault(f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}", "rows-no-room")
+        return Issue(f"{_backwards(time_s, lines, int(squeezed[0]))}, {words}; {REMEDY}", "rows-contradict")
     words = (
         f"{_backwards(time_s, lines, int(again[0]))}, with the same values throughout: fewer than two different rows"
     )
-    return Fault(words, "too-few-rows")
+    return Issue(words, "too-few-rows")
 
 
 def _blocks(rows: IntArray) -> str:
@@ -547,7 +543,7 @@ def _times(time_s: FloatArray, rows: IntArray) -> str:
     )
 
 
-def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArray, list[Finding]]:
+def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArray, list[Issue]]:
     """Rows to use (n,), and a finding for each reason why others are not."""
     name = label.rsplit(".", 1)[-1]
     findings = []
@@ -555,21 +551,21 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
     if not use.all():
         again = time_s[~use]
         words = f"{len(again)} rows repeat the time of the row before and are left out, as time.repeats asks"
-        findings.append(Finding(name, words, float(again[0]), float(again[-1]), code="rows-repeated"))
+        findings.append(Issue(words, "rows-left-out", name, float(again[0]), float(again[-1])))
     if source.use_s is not None:
         inside = np.any([(time_s >= start) & (time_s <= stop) for start, stop in source.use_s], axis=0)
         left = int((use & ~inside).sum())
         if left:
             spans = ", ".join(f"{start:g} to {stop:g} s" for start, stop in source.use_s)
             words = f"{left} of {int(use.sum())} rows lie outside use_s ({spans}) and are left out"
-            findings.append(Finding(name, words, np.nan, np.nan, code="rows-outside-span"))
+            findings.append(Issue(words, "rows-outside-span", name))
         use &= inside
     return use, findings
 
 
 def oversampled(
     name: str, time_s: FloatArray, thinning: tuple[ThinnedSpan, ...], components: tuple[str, ...]
-) -> list[Finding]:
+) -> list[Issue]:
     """Say how many of a tracker's rows only check the trajectory, of which components."""
     idle = {c: int((~spaced(time_s, spacing_s(thinning, time_s, c))).sum()) for c in components}
     if not any(idle.values()):
@@ -578,4 +574,4 @@ def oversampled(
     rows = str(counts.pop()) if len(counts) == 1 else ", ".join(f"{count} ({c})" for c, count in idle.items() if count)
     spacings = "; ".join(sorted({f"{s.every_s:g} s" for s in thinning if s.every_s > 0.0}))
     words = f"{rows} of {len(time_s)} rows lie closer than every_s = {spacings}: they are predicted and not used"
-    return [Finding(name, words, np.nan, np.nan, code="rows-oversampled")]
+    return [Issue(words, "samples-averaged", name)]

@@ -59,7 +59,7 @@ def magnetic_field_ned_t(
 
     stamp = parse_utc(at_utc)
     if not IGRF_FROM <= stamp <= IGRF_TO:
-        raise GateError(f"magnetic field: {at_utc} lies outside IGRF-14, 1900 to 2030", code="epoch-range")
+        raise GateError(f"magnetic field: {at_utc} lies outside IGRF-14, 1900 to 2030", code="value-range")
     lat, lon, height = np.atleast_1d(*np.broadcast_arrays(latitude_rad, longitude_rad, height_m))
     east, north, up = ppigrf.igrf(np.rad2deg(lon), np.rad2deg(lat), height / 1e3, stamp.replace(tzinfo=None))
     return np.column_stack([north[0], east[0], -up[0]]) * 1e-9

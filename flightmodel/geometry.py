@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -31,11 +32,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr
 
 from flightmodel import rotations
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError
-from flightmodel.config import FileBeside, KeyFaults, Length, Section, beside
+from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, Issue
+from flightmodel.config import FileBeside, KeyFault, Length, Section, beside
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
 from flightmodel.mesh_sections import section_supports, touching_circles
@@ -117,27 +118,23 @@ class ShellGeometry(Section):
         shell._mesh = mesh
         return shell
 
-    @model_validator(mode="after")
-    def _possible(self) -> ShellGeometry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
         outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
-        faults: list[tuple[str, object, str]] = []
         if self.nose_radius_m * np.cos(angle) >= base:
             words = f"the nose cap is wider than the base; below {base / np.cos(angle):.4g} m for this base and angle"
-            faults.append(("nose_radius_m", self.nose_radius_m, words))
+            yield "nose_radius_m", self.nose_radius_m, words
         if self.torus_minor_radius_m >= self.innermost_torus_radius_m:
             words = (
                 f"wanted below innermost_torus_radius_m = {self.innermost_torus_radius_m:g}, or the torus has no hole"
             )
-            faults.append(("torus_minor_radius_m", self.torus_minor_radius_m, words))
+            yield "torus_minor_radius_m", self.torus_minor_radius_m, words
         if outermost - self.torus_minor_radius_m >= base:
             words = f"the outermost of {self.torus_count} tori, of radius {outermost:.4g} m, lies outside the base"
-            faults.append(("base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"))
+            yield "base_radius_m", base, f"{words}; check torus_count and torus_spacing_m"
         if self.centerbody_radius_m >= base:
-            faults.append(("centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "centerbody_radius_m", self.centerbody_radius_m, f"wanted below base_radius_m = {base:g}"
 
 
 def torus_circles(geometry: ShellGeometry) -> tuple[FloatArray, FloatArray]:
@@ -252,7 +249,7 @@ def torus_limb(
     if (np.abs(ratio) >= 1.0).any():
         raise GateError(
             f"viewpoint {np.round(viewpoint_shell_m, 3).tolist()} m lies inside torus {torus_index}",
-            code="viewpoint-inside",
+            code="camera-inside-shell",
         )
     v = np.arctan2(b_term, a_term) + np.arccos(ratio)
     points = (radius[torus_index] + minor * np.cos(v))[:, None] * outboard
@@ -283,7 +280,7 @@ def edge_circles(geometry: ShellGeometry, eye_shell_m: FloatArray, clock_lv_rad:
     circles = touching_circles(near, np.column_stack([np.full(len(at), -eye_shell_m[0]), across]))
     if not np.isfinite(circles).all():
         where = np.round(eye_shell_m, 3).tolist()
-        raise GateError(f"the mesh of the aeroshell has no edge as seen from {where} m", code="mesh-no-edge")
+        raise GateError(f"the mesh of the aeroshell has no edge as seen from {where} m", code="mesh-unusable")
     return circles
 
 
@@ -334,7 +331,7 @@ Faces = NDArray[np.int64]
 
 KINDS = (".stl", ".obj", ".glb")
 LARGEST_BYTES, MOST_FACES, MOST_NODES = 50_000_000, 500_000, 10_000
-EMPTY = Fault("is empty: it has no face", "mesh-empty")
+EMPTY = Issue("is empty: it has no face", "mesh-unusable")
 UNITS_M = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "feet": 0.3048}
 WRONG_UNIT, SUGGESTED = 1.6, 1.1  # units lie a factor of 2.5 apart; one that makes the size right to a tenth is named
 SAME_RIM, SAME_END = 0.1, 0.25  # of the rim's radius, of the centerbody's length
@@ -353,17 +350,13 @@ class MeshFile(Section):
     zero_clock: Axis | None = None
     nose: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
 
-    @model_validator(mode="after")
-    def _usable(self) -> MeshFile:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if Path(self.file).suffix.lower() not in KINDS:
-            faults.append(("file", self.file, f"a mesh ends in {', '.join(KINDS)}"))
+            yield "file", self.file, f"a mesh ends in {', '.join(KINDS)}"
         if self.zero_clock is not None and self.zero_clock[-1] == self.forward[-1]:
             words = f"the axis towards clocking angle 0 lies across forward = '{self.forward}'"
-            faults.append(("zero_clock", self.zero_clock, words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "zero_clock", self.zero_clock, words
 
     @property
     def rows(self) -> FloatArray:
@@ -472,7 +465,7 @@ def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
         raise GateError(f"{path}: {unfit.strerror}", unfit.code) from None
     fault = {"stl": _fault_of_stl, "obj": _fault_of_obj, "glb": _fault_of_glb}[kind](data) if data else EMPTY
     if fault:
-        raise GateError(f"{path}: {fault}", code=getattr(fault, "code", "mesh-unreadable"))
+        raise GateError(f"{path}: {fault}", code=getattr(fault, "code", "file-unreadable"))
     vertices, faces = _decoded(path, data, kind)
     rest = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = faces[rest]
@@ -484,7 +477,7 @@ def read_mesh(path: Path) -> tuple[FloatArray, Faces]:
     if len(odd):
         place = np.round(vertices[odd[0] // len(vertices)], 4).tolist()
         words = f"{len(odd)} of its {len(edges)} edges bound one face or three, the first at {place} in the file's unit"
-        raise GateError(f"{path}: is not watertight: {words}; {TO_CLOSE}", code="mesh-not-watertight")
+        raise GateError(f"{path}: is not watertight: {words}; {TO_CLOSE}", code="mesh-unusable")
     return vertices, faces
 
 
@@ -504,13 +497,13 @@ def _decoded(path: Path, data: bytes, kind: str) -> tuple[FloatArray, Faces]:
             mesh = trimesh.Trimesh(whole.vertices, whole.faces, process=True)
     except Exception as fault:  # a decoder of untrusted files raises whatever its parts raise
         raise GateError(
-            f"{path}: cannot be decoded as {kind.upper()} ({type(fault).__name__}: {fault})", code="mesh-unreadable"
+            f"{path}: cannot be decoded as {kind.upper()} ({type(fault).__name__}: {fault})", code="file-unreadable"
         ) from None
     if total == 0:
         raise GateError(f"{path}: {EMPTY}", code=EMPTY.code)
     if total > MOST_FACES:
         raise GateError(
-            f"{path}: {total} faces where {MOST_FACES} at most are taken; thin it out", code="mesh-too-fine"
+            f"{path}: {total} faces where {MOST_FACES} at most are taken; thin it out", code="file-too-large"
         )
     if not is_finite:
         raise GateError(f"{path}: vertices are not finite numbers", code="not-finite")
@@ -593,7 +586,7 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         try_this = " or ".join(f"unit_m = {u:g} ({n})" for n, u in fits.items()) or f"unit_m = {wanted_m / size:.4g}"
         words = f"{named}would be {size * spec.unit_m:.4g} m in size where [geometry] has {wanted_m:.4g} m"
         raise ConfigError(
-            f"{key}.unit_m' = {spec.unit_m:g}: {words}; try {try_this}, or correct [geometry]", code="mesh-size"
+            f"{key}.unit_m' = {spec.unit_m:g}: {words}; try {try_this}, or correct [geometry]", code="mesh-unusable"
         )
     placed = spec.unit_m * (vertices - np.array(spec.nose)) @ spec.rows.T
     head = f"{named}{len(faces)} faces, {size * spec.unit_m:.3f} m in size"
@@ -602,17 +595,17 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
         ends = tuple(round(float(end), 4) + 0.0 for end in (-placed[:, 0].max(), -placed[:, 0].min()))
         if max(abs(ends[1] - length), abs(ends[0])) > max(SAME_END * length, 2.0 * across):
             words = f"reaches from station {ends[0]:.3f} to {ends[1]:.3f} m where [geometry] has 0 to {length:g} m"
-            raise ConfigError(f"{key}': {named}{words}; check forward and nose", code="mesh-pose")
+            raise ConfigError(f"{key}': {named}{words}; check forward and nose", code="mesh-unusable")
         return BodyMesh(placed, faces, f"{head}, from station {ends[0]:.3f} to {ends[1]:.3f} m")
     front_m, turn_it = float(-placed[:, 0].max()), "check forward, zero_clock and nose"
     if front_m < -SAME_RIM * rim_m:
         tip = np.array(spec.nose) - (front_m / spec.unit_m) * spec.rows[0]
         words = f"reaches {-front_m:.3f} m ahead of the vehicle's nose; if forward is right, nose = {_shown(tip)}"
-        raise ConfigError(f"{key}.nose' = {list(spec.nose)}: {named}{words}", code="mesh-pose")
+        raise ConfigError(f"{key}.nose' = {list(spec.nose)}: {named}{words}", code="mesh-unusable")
     rim = rim_circle(placed)
     if rim.rms_m > NO_CIRCLE * rim.radius_m:
         words = f"its outline from ahead is no circle (rms {rim.rms_m:.3f} m)"
-        raise ConfigError(f"{key}.forward' = '{spec.forward}': {named}{words}; {turn_it}", code="mesh-pose")
+        raise ConfigError(f"{key}.forward' = '{spec.forward}': {named}{words}; {turn_it}", code="mesh-unusable")
     off_m = float(np.hypot(*rim.centre_m))
     words = (
         f"rim of radius {rim.radius_m:.3f} m at station {rim.station_m:.3f} m, {off_m:.3f} m off the axis, where "
@@ -620,7 +613,7 @@ def _laid(body: str, spec: MeshFile, vertices: FloatArray, faces: Faces, geometr
     )
     if max(abs(rim.radius_m - rim_m), off_m) > SAME_RIM * rim_m:
         allowed = f"{SAME_RIM * rim_m:.3f} m of difference is allowed"
-        raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]", code="mesh-pose")
+        raise ConfigError(f"{key}': {named}{words}; {allowed}; {turn_it}, or correct [geometry]", code="mesh-unusable")
     apart = abs(rim.station_m - rim_station_m) > SAME_RIM * rim_m
     words += ", so one of the two is not the vehicle's: check forward and nose" if apart else ""
     return BodyMesh(placed, faces, f"{head}; {words}", apart, rim)
@@ -664,7 +657,7 @@ def _check_lenses(named: str, mesh: BodyMesh, lenses_m: dict[str, FloatArray]) -
         words = f"the lenses of {', '.join(inside)} lie inside it and would see nothing"
         raise ConfigError(
             f"{named}: {words}; leave their housings out of the mesh, or check forward, nose and cameras",
-            code="lens-inside-mesh",
+            code="mesh-unusable",
         )
 
 

@@ -14,9 +14,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, Issue
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
-from flightmodel.telemetry import AttitudePrior, Finding, GnssRecord, TriadRecord
+from flightmodel.telemetry import AttitudePrior, GnssRecord, TriadRecord
 
 FILTER_S = 1.0  # over which a receiver smooths its solution; a shorter shock moves it by less than its noise
 MOST_LINEAR_RAD = float(np.deg2rad(30.0))
@@ -27,7 +27,7 @@ def input_findings(
     receivers: Mapping[str, GnssRecord],
     prior: AttitudePrior | None,
     most_g: Mapping[str, float],
-) -> list[Finding]:
+) -> list[Issue]:
     """Findings of a flight that inertial sensors carry.
 
     Parameters
@@ -45,7 +45,7 @@ def input_findings(
     return found + (_wide_attitude(prior) if prior is not None else [])
 
 
-def _beyond_receiver(name: str, fixes: GnssRecord, force: TriadRecord, most_g: float) -> list[Finding]:
+def _beyond_receiver(name: str, fixes: GnssRecord, force: TriadRecord, most_g: float) -> list[Issue]:
     """Say which fixes were taken at more than a receiver can follow."""
     mean_g = _mean_before(fixes.time_s, force) / STANDARD_GRAVITY_MPS2
     doubtful = np.flatnonzero(mean_g > most_g)
@@ -57,7 +57,7 @@ def _beyond_receiver(name: str, fixes: GnssRecord, force: TriadRecord, most_g: f
         f"{mean_g[doubtful].max():.3g} g: beyond what a receiver is made for (most_g) they lag or are extrapolated, "
         "by hundreds of metres and until seconds later, with good satellite counts; try without them (use_s)"
     )
-    return [Finding(name, words, start, stop, "fixes-beyond-dynamics")]
+    return [Issue(words, "fixes-beyond-dynamics", name, start, stop)]
 
 
 def _mean_before(time_s: FloatArray, force: TriadRecord) -> FloatArray:
@@ -72,7 +72,7 @@ def _mean_before(time_s: FloatArray, force: TriadRecord) -> FloatArray:
     return out
 
 
-def _wide_attitude(prior: AttitudePrior) -> list[Finding]:
+def _wide_attitude(prior: AttitudePrior) -> list[Issue]:
     """Say that a stated attitude is too uncertain for a filter that is linear about it."""
     if not (prior.sd_rad > MOST_LINEAR_RAD).any():
         return []
@@ -82,4 +82,4 @@ def _wide_attitude(prior: AttitudePrior) -> list[Finding]:
         f"{np.rad2deg(MOST_LINEAR_RAD):.0f} deg the filter, linear about it, may converge to another attitude with "
         "green checks; compare starts from several attitudes, or state [start] at_rest or a magnetometer"
     )
-    return [Finding("attitude_prior", words, prior.time_s, prior.time_s, "attitude-wide")]
+    return [Issue(words, "attitude-wide", "attitude_prior", prior.time_s, prior.time_s)]

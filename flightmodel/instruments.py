@@ -17,15 +17,15 @@ Range Commanders Council 753-95 (error model of tracking radars).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, Field, create_model, model_validator
+from pydantic import AfterValidator, BaseModel, Field, create_model
 
-from flightmodel.checks import Fault, FloatArray
-from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFaults, Place, Section
+from flightmodel.checks import FloatArray, Issue
+from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFault, Place, Section
 from flightmodel.earth import undulation_m
 from flightmodel.tables import Declared, Source, Thinning
 
@@ -578,27 +578,23 @@ class Mounted(Source):
     axes: tuple[BodyAxis, BodyAxis, BodyAxis] | None = None
     position_from_datum_body_m: tuple[Place, Place, Place] | None = None
 
-    @model_validator(mode="after")
-    def _one_mount(self) -> Mounted:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.axes is not None:
             if self.mount is not None:
-                faults.append(("axes", list(self.axes), f"mount = '{self.mount}' states the same; keep one of the two"))
+                yield "axes", list(self.axes), f"mount = '{self.mount}' states the same; keep one of the two"
             dcm = self.dcm_body_sensor
             if not np.allclose(dcm @ dcm.T, np.eye(3)):
                 words = "two sensor axes point along the same body axis; each wants one of its own"
-                faults.append(("axes", list(self.axes), Fault(words, "axes-parallel")))
+                yield "axes", list(self.axes), Issue(words, "axes-parallel")
             elif np.linalg.det(dcm) < 0.0:
                 words = (
                     "left-handed axes (a mirror image): change a sign, swap two, or give one column a unit as -degps"
                 )
-                faults.append(("axes", list(self.axes), Fault(words, "axes-left-handed")))
+                yield "axes", list(self.axes), Issue(words, "axes-left-handed")
         elif self.position_from_datum_body_m is not None and self.mount != "body":
             words = 'goes with axes = ["+x", "+y", "+z"] or mount = "body"; a package of the vehicle has its own place'
-            faults.append(("position_from_datum_body_m", list(self.position_from_datum_body_m), words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "position_from_datum_body_m", list(self.position_from_datum_body_m), words
 
     @property
     def dcm_body_sensor(self) -> FloatArray:
@@ -654,21 +650,18 @@ class TrackingSource(Source):
         """What ``every_s`` may name."""
         return ("height",)
 
-    @model_validator(mode="after")
-    def _thinned_components_measured(self) -> TrackingSource:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         named = {c for span in self.every_s for c in span.components}
         words = f"is not among what is measured here: {', '.join(self.components)}"
-        faults: list[tuple[str, object, str]] = [("every_s", c, words) for c in sorted(named - {*self.components})]
-        if faults:
-            raise KeyFaults(faults)
-        return self
+        for component in sorted(named - {*self.components}):
+            yield "every_s", component, words
 
 
-def check_servo(key: str, stated: float, servo_hz: float) -> None:
-    """Raise `KeyFaults` where a fraction of a servo's lag is stated, of a flight or a scenario, and no bandwidth."""
+def servo_faults(key: str, stated: float, servo_hz: float) -> Iterable[KeyFault]:
+    """Yield that a fraction of a servo's lag is stated, of a flight or a scenario, and no bandwidth."""
     if stated > 0.0 and servo_hz == 0.0:
-        words = "a fraction of the servo's lag: state its bandwidth, angle_servo_hz, too"
-        raise KeyFaults([(key, stated, words)])
+        yield key, stated, "a fraction of the servo's lag: state its bandwidth, angle_servo_hz, too"
 
 
 TrackerReading = Literal["range", "az", "el", "range_rate"]
@@ -691,10 +684,10 @@ class RadarEntry(TrackingSource):
         """What ``every_s`` may name."""
         return self.measures
 
-    @model_validator(mode="after")
-    def _lag_has_a_servo(self) -> RadarEntry:
-        check_servo("servo_lag_sd", getattr(self, "servo_lag_sd", 0.0), self.angle_servo_hz)
-        return self
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        yield from super().key_faults()
+        yield from servo_faults("servo_lag_sd", getattr(self, "servo_lag_sd", 0.0), self.angle_servo_hz)
 
 
 @with_keys(SITES.file_keys())
@@ -712,15 +705,15 @@ class Heights(TrackingSource):
     geoid_undulation_m: Undulation | None = None
     ground_height_m: Annotated[float, Field(ge=-1000.0, le=9000.0)] | None = None
 
-    @model_validator(mode="after")
-    def _undulation_meant(self) -> Heights:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        yield from super().key_faults()
         if self.height_is != "msl" and self.geoid_undulation_m is not None:
             words = 'is used only with height_is = "msl"; say that, or remove it'
-            raise KeyFaults([("geoid_undulation_m", self.geoid_undulation_m, words)])
+            yield "geoid_undulation_m", self.geoid_undulation_m, words
         if (self.height_is == "ground") != (self.ground_height_m is not None):
             words = 'and height_is = "ground" need each other: m above the ellipsoid, where heights are zero'
-            raise KeyFaults([("ground_height_m", self.ground_height_m, words)])
-        return self
+            yield "ground_height_m", self.ground_height_m, words
 
     def to_ellipsoid_m(self, latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
         """What is added to heights of the table at places (...,), m: the ground's, the stated geoid's, or EGM96's."""
@@ -769,11 +762,10 @@ class BarometerEntry(Heights):
 class AtmosphereEntry(Source):
     """The day's sounding; standard deviations default to those of rocketsondes and balloons."""
 
-    @model_validator(mode="after")
-    def _no_times(self) -> AtmosphereEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.use_s is not None:
-            raise KeyFaults([("use_s", [list(span) for span in self.use_s], "a sounding is by altitude, not by time")])
-        return self
+            yield "use_s", [list(span) for span in self.use_s], "a sounding is by altitude, not by time"
 
 
 class FramesEntry(Source):

@@ -28,7 +28,7 @@ from flightmodel.atmosphere import (
     profile_from_sounding,
 )
 from flightmodel.camera_edits import EDITS_FILE, NO_EDITS, CameraEdits, read_edits
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.entry_state import fixed_axes
 from flightmodel.film import Frames, film_fault, film_timing_fault, image_fault, working_camera
@@ -59,7 +59,6 @@ from flightmodel.instruments import (
 )
 from flightmodel.telemetry import (
     BarometerRecord,
-    Finding,
     GnssRecord,
     RadarRecord,
     Sounding,
@@ -105,7 +104,7 @@ def read_radar(gate: Gate, name: str, source: RadarEntry) -> RadarRecord | None:
     whole = np.isfinite(read).all(axis=1)
     if not whole.any():
         words = " and ".join(q.short for q in measured)
-        gate.refuse(f"{label}: {table.path}: no row with {words}; remove the tracker", "no-samples")
+        gate.refuse(f"{label}: {table.path}: no row with {words}; remove the tracker", "too-few-rows")
         return None
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in measured), read))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s, source.components))
@@ -153,7 +152,7 @@ def read_gnss(
     alone = _has_no_position(table)
     measured, names, what = (velocity, ECEF_SPEEDS, "velocity") if alone else (position, ECEF, "position")
     if not np.isfinite(measured).all(axis=1).any():
-        gate.refuse(f"{label}: {table.path}: no fix with a whole {what}; remove the receiver", "no-samples")
+        gate.refuse(f"{label}: {table.path}: no fix with a whole {what}; remove the receiver", "too-few-rows")
         return None
     new = _new_fixes(np.column_stack([position, velocity]))
     if 2 <= new.sum() < len(new):
@@ -176,12 +175,12 @@ def _good_fixes(gate: Gate, name: str, table: Table, asked: dict[str, int]) -> B
         if not enough.all():
             what = "satellites" if short == "nsat" else "mode"
             words = f"{int((~enough).sum())} of {len(enough)} fixes have {what} below {count} and are left out"
-            gate.findings.append(Finding(name, words, np.nan, np.nan, code="fixes-poor"))
+            gate.findings.append(Issue(words, "too-few-rows", name))
         good &= enough
     if good.sum() < 2:
         gate.refuse(
             f"{table.label}: {table.path}: {good.sum()} fixes are good enough by flight.toml; lower what it asks",
-            "fixes-poor",
+            "too-few-rows",
         )
     return good
 
@@ -192,7 +191,7 @@ def _new_fixes(values: FloatArray) -> BoolArray:
     return np.append(True, ~same.all(axis=1) | np.isnan(values[1:]).all(axis=1))
 
 
-def _held(name: str, time_s: FloatArray, new: BoolArray) -> Finding:
+def _held(name: str, time_s: FloatArray, new: BoolArray) -> Issue:
     """Say that a log writes the receiver's last fix until the next: it is one measurement, of its first row's time."""
     first = np.flatnonzero(new)
     held = time_s[np.append(first[1:], len(new)) - 1] - time_s[first]
@@ -201,7 +200,7 @@ def _held(name: str, time_s: FloatArray, new: BoolArray) -> Finding:
         f"{int((~new).sum())} of {len(new)} rows hold the fix of the row before and are left out, for up to "
         f"{held[k]:.3g} s: a fix counts once, at the time of its first row"
     )
-    return Finding(name, words, float(time_s[first[k]]), float(time_s[first[k]] + held[k]), code="fixes-held")
+    return Issue(words, "rows-left-out", name, float(time_s[first[k]]), float(time_s[first[k]] + held[k]))
 
 
 def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet) -> FloatArray | None:
@@ -225,14 +224,14 @@ def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet
             f"{table.label}: {table.path}: line 1: no column {absent}; a position is lat_deg, lon_deg, alt_m, or "
             f"x_ecef_m, y_ecef_m, z_ecef_m; without one a velocity is vx_ecef_mps, vy_ecef_mps, vz_ecef_mps; other "
             f"columns are declared in {table.label}.columns",
-            "table-column-missing",
+            "column-missing",
         )
         return None
     if source.axes != "fixed" and (form != ECEF or set(NED_SPEEDS) & set(table.columns)):
         words = (
             f'axes = "{source.axes}" goes with x, y, z and vx, vy, vz; other columns are of the planet: take axes out'
         )
-        gate.refuse_config(f"{table.label}: {words}", "axes-conflict")
+        gate.refuse_config(f"{table.label}: {words}", "keys-conflict")
         return None
     if form == ECEF:
         position = np.column_stack([table.columns[short] for short in ECEF])
@@ -264,7 +263,7 @@ def _note_geoid(gate: Gate, name: str, source: Heights, undulation_m: FloatArray
         low, high = np.nanmin(undulation_m), np.nanmax(undulation_m)
         size = f"{low:.1f} m" if high - low < 0.1 else f"{low:.1f} to {high:.1f} m"
         words = f"heights above mean sea level became ellipsoidal with EGM96's undulation, {size}"
-        gate.findings.append(Finding(name, words, np.nan, np.nan, code="undulation-by-model"))
+        gate.findings.append(Issue(words, "values-converted", name))
 
 
 def _refuse_fixes(gate: Gate, table: Table, bad: BoolArray, words: str) -> None:
@@ -286,7 +285,7 @@ def _velocities(
         if found and found != set(form):
             absent = ", ".join(sorted(set(form) - found))
             words = f"a velocity lacks {absent}; declare it in {table.label}.columns, or write velocity = false"
-            gate.refuse(f"{table.label}: {table.path}: line 1: {words}", "table-column-missing")
+            gate.refuse(f"{table.label}: {table.path}: line 1: {words}", "column-missing")
             return None
     stated = [form for form in there if set(form) & set(source.columns)]
     form = stated[0] if len(stated) == 1 else ECEF_SPEEDS if there[ECEF_SPEEDS] else NED_SPEEDS
@@ -346,14 +345,14 @@ def read_barometer(
             words += (
                 "; near and above the speed of sound a port does not measure static pressure: use_s can leave that out"
             )
-        gate.findings.append(Finding(name, words, np.nan, np.nan, code="heights-from-pressure"))
+        gate.findings.append(Issue(words, "values-converted", name))
     else:
         height = table.columns["height"]
     undulation = source.to_ellipsoid_m(*place)
     _note_geoid(gate, name, source, undulation)
     height = height + undulation
     if not np.isfinite(height).any():
-        gate.refuse(f"{label}: {table.path}: every reading is missing; remove the barometer", "no-samples")
+        gate.refuse(f"{label}: {table.path}: every reading is missing; remove the barometer", "too-few-rows")
         return None
     gate.findings.extend(find_faults(name, table.time_s, (form,), height[:, None]))
     gate.findings.extend(oversampled(name, table.time_s, source.every_s, source.components))
@@ -368,7 +367,7 @@ def _barometer_form(gate: Gate, table: Table, source: BarometerEntry) -> str | N
     form = clear[0] if clear else None
     if not there:
         words = "no column height_m and none pressure_pa; declare one of the two"
-        gate.refuse(f"{table.label}: {table.path}: line 1: {words} in {table.label}.columns", "table-column-missing")
+        gate.refuse(f"{table.label}: {table.path}: line 1: {words} in {table.label}.columns", "column-missing")
     elif form is None:
         words = "heights and pressures are both there; declare the one to read"
         gate.refuse_config(
@@ -413,7 +412,7 @@ def read_triad(
         return None
     values = np.column_stack([table.columns[q.short] for q in quantities])
     if not np.isfinite(values).all(axis=1).any():
-        gate.refuse(f"sensors.{name}: {table.path}: every sample is missing", "no-samples")
+        gate.refuse(f"sensors.{name}: {table.path}: every sample is missing", "too-few-rows")
         return None
     gate.findings.extend(find_faults(name, table.time_s, tuple(q.short for q in quantities), values))
     if mounting is None:
@@ -441,16 +440,14 @@ def _mounting(
         words = (
             'write mount = "body" (along body axes) or axes = ["+x", "+y", "+z"] with the body axis of each of its axes'
         )
-        gate.refuse_config(f"sensors.{name}: {why}, and flight.toml names no vehicle; {words}", "mount-missing")
+        gate.refuse_config(f"sensors.{name}: {why}, and flight.toml names no vehicle; {words}", "input-missing")
         return None
     if vehicle is None:  # refused already
         return None
     if package not in vehicle.sensors:
         known = [*vehicle.sensors, BODY]
         hint = nearest_name(package, known)
-        gate.refuse_config(
-            f"sensors.{name}.mount = '{package}'{hint}: not on vehicle '{vehicle.name}'", "mount-unknown"
-        )
+        gate.refuse_config(f"sensors.{name}.mount = '{package}'{hint}: not on vehicle '{vehicle.name}'", "name-unknown")
         return None
     mount = vehicle.sensors[package]
     return np.array(mount.position_from_datum_body_m), mount.dcm_body_sensor
@@ -474,7 +471,7 @@ def read_sun(gate: Gate, source: SunEntry) -> SunRecord | None:
     seen = np.isfinite(values.reshape(-1, heads, 2)).all(axis=2)
     dark = np.asarray(seen.sum(axis=1) == 0)
     if dark.all():
-        gate.refuse(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]", "no-samples")
+        gate.refuse(f"sensors.sun: {table.path}: no head ever sees the Sun; remove [sensors.sun]", "too-few-rows")
         return None
     gate.findings.extend(find_faults("sun", table.time_s, tuple(q.short for q in quantities), values, dark))
     clock, field = np.deg2rad(source.heads_lv_deg), float(np.deg2rad(source.field_deg))
@@ -488,18 +485,16 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
     ``label`` is the table of ``flight.toml`` that states it.
     """
     if source.columns:
-        gate.refuse_config(f"{label}.columns: the frame list has only t_s and frame", "quantity-unknown")
+        gate.refuse_config(f"{label}.columns: the frame list has only t_s and frame", "name-unknown")
     if (source.folder is None) == (source.film is None):
         gate.refuse_config(
-            f"{label}: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted", "frames-source"
+            f"{label}: one of folder (of images) and film (a .webm, .mp4 or .avi file) is wanted", "keys-conflict"
         )
         return None
     path, images = gate.path(source.file), gate.path(source.film or source.folder or "")
     if vehicle is not None and source.camera not in vehicle.cameras:
         hint = nearest_name(source.camera, list(vehicle.cameras))
-        gate.refuse_config(
-            f"{label}.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'", "camera-unknown"
-        )
+        gate.refuse_config(f"{label}.camera = '{source.camera}'{hint}: not on vehicle '{vehicle.name}'", "name-unknown")
         return None
     if path is None or images is None or vehicle is None:
         return None
@@ -509,7 +504,7 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
     time_s = tables.times_s(table, source.time_column, gate.t0, path, label, gate.faults)
     if "frame" not in table.columns:
         gate.refuse(
-            f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}", "table-column-missing"
+            f"{label}: {path}: line 1: no column 'frame'{nearest_name('frame', table.columns)}", "column-missing"
         )
         return None
     camera = vehicle.cameras[source.camera]
@@ -527,11 +522,11 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
     if time_s is None or len(gate.faults) > before:
         return None
     if not len(time_s):
-        gate.refuse(f"{label}: {path}: use_s leaves no frame", "use-span-empty")
+        gate.refuse(f"{label}: {path}: use_s leaves no frame", "too-few-rows")
         return None
     if not time_s[0] - 2.0 <= source.benchmark_s <= time_s[-1] + 2.0:
         span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
-        gate.refuse_config(f"{label}.benchmark_s = {source.benchmark_s}: frames span {span}", "benchmark-outside-film")
+        gate.refuse_config(f"{label}.benchmark_s = {source.benchmark_s}: frames span {span}", "time-not-covered")
         return None
     edits = _edits(gate, label, source.camera, time_s, vehicle)
     benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
@@ -545,7 +540,7 @@ def _reduced(gate: Gate, label: str, frames: Frames) -> Frames:
     if camera.size_px == filed_px:
         return frames
     words = f"pictures of {filed_px[0]} x {filed_px[1]} pixels, read at {camera.width_px} x {camera.height_px}"
-    gate.findings.append(Finding(label, words, np.nan, np.nan, "pictures-reduced"))
+    gate.findings.append(Issue(words, "frame-size", label))
     edits = frames.edits.resized(filed_px, camera.size_px)
     return replace(frames, camera=camera, edits=edits, filed_px=filed_px)
 
@@ -566,7 +561,7 @@ def _edits(gate: Gate, label: str, name: str, time_s: FloatArray, vehicle: Vehic
         gate.faults.extend(f for f in fault.faults if f not in gate.faults)  # of several cameras each reads the table
         return NO_EDITS
     if edits.rows:
-        gate.findings.append(Finding(label, f"edits by hand ({EDITS_FILE}): {edits}", np.nan, np.nan, "edited-by-hand"))
+        gate.findings.append(Issue(f"edits by hand ({EDITS_FILE}): {edits}", "edited-by-hand", label))
     return edits
 
 
@@ -581,7 +576,7 @@ def _image_paths(
         if wrong:
             where = f"{label}: {path}: line {tables.line_of(table, row)}: {image}"
             gate.refuse(
-                f"{where}: {wrong}; replace the file or remove the line", getattr(wrong, "code", "image-unreadable")
+                f"{where}: {wrong}; replace the file or remove the line", getattr(wrong, "code", "file-unreadable")
             )
         paths.append(image)
     return tuple(paths)
@@ -596,24 +591,24 @@ def _film_numbers(
     for row in np.flatnonzero(used & ~whole)[:5].tolist():
         where = f"{label}: {path}: line {tables.line_of(table, row)}: frame '{text.iloc[row]}'"
         gate.refuse(
-            f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0', "frame-number"
+            f'{where}: with film = "{film.name}" a frame\'s number is wanted, the first being 0', "frame-missing"
         )
     numbers = np.array([int(t) for t in text.to_numpy()[used & whole]], dtype=np.int64)
     if len(numbers) and (np.diff(numbers) < 0).any():
         row = int(np.flatnonzero(used & whole)[int(np.argmax(np.diff(numbers) < 0)) + 1])
         where = f"{label}: {path}: line {tables.line_of(table, row)}"
-        gate.refuse(f"{where}: frame numbers fall where times rise; sort the list by time", "frame-number")
+        gate.refuse(f"{where}: frame numbers fall where times rise; sort the list by time", "frame-missing")
     wrong = film_fault(film, camera.size_px, int(numbers.max(initial=0)))
     if wrong:
-        gate.refuse(f"{label}: {film}: {wrong}", getattr(wrong, "code", "film-unreadable"))
+        gate.refuse(f"{label}: {film}: {wrong}", getattr(wrong, "code", "file-unreadable"))
         return numbers
     again = int((np.diff(numbers) == 0).sum())
     if again:
         words = f"{path.name}: {again} of {len(numbers)} lines name the same frame as the line before; check the list"
-        gate.findings.append(Finding(label, words, np.nan, np.nan, code="frame-repeated"))
+        gate.findings.append(Issue(words, "frame-frozen", label))
     timing = film_timing_fault(film)
     if timing:
-        gate.findings.append(Finding(label, f"{film.name}: {timing}", np.nan, np.nan, timing.code))
+        gate.findings.append(Issue(f"{film.name}: {timing}", timing.code, label))
     return numbers
 
 
@@ -625,7 +620,7 @@ WHOLE = 0.75  # part of a block's samples that its mean needs
 _LEAST_LEVELS, _MOST_LEVELS = 5, 0.5
 
 
-def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Issue]]:
     """Means of blocks at about 1 kHz of a record of more than 2 kHz, and a finding; other records as they are.
 
     Noise and resolution of the record's data sheet become those of a mean. A record whose rate changes is left as it
@@ -646,10 +641,10 @@ def averaged(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
         record.spec, noise_sd=record.spec.noise_sd / np.sqrt(count), resolution=record.spec.resolution / np.sqrt(count)
     )
     words = f"{len(block)} samples at {1.0 / usual:.0f} Hz, of which means of {count} are used"
-    return TriadRecord(spec, time_s, means), [Finding(spec.name, words, np.nan, np.nan, code="samples-averaged")]
+    return TriadRecord(spec, time_s, means), [Issue(words, "samples-averaged", spec.name)]
 
 
-def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
+def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Issue]]:
     """Record whose resolution is the least count that its readings show, and a finding, where that is not stated.
 
     Readings of a converter are whole multiples of one step. Left out are steps below the noise, which hides them.
@@ -658,7 +653,7 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Finding]]:
     if step <= 1.1 * max(record.spec.noise_sd, record.spec.resolution):
         return record, []
     words = f"readings are multiples of {step:.3g} (SI), more than noise and resolution state: taken for resolution"
-    finding = Finding(record.spec.name, words, np.nan, np.nan, code="least-count")
+    finding = Issue(words, "least-count", record.spec.name)
     return replace(record, spec=replace(record.spec, resolution=step)), [finding]
 
 
@@ -722,13 +717,13 @@ def _winds(gate: Gate, table: Table, planet: earth.Planet) -> tuple[FloatArray, 
         return c["wind_north"], c["wind_east"]
     if {"wind_speed", "wind_from"} <= set(c):
         words = "wind is given by where it comes from: converted to the velocity of the air mass"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="wind-direction-converted"))
+        gate.findings.append(Issue(words, "values-converted", SOURCE))
         return -c["wind_speed"] * np.cos(c["wind_from"]), -c["wind_speed"] * np.sin(c["wind_from"])
     if planet != earth.WGS84 and not {"wind_north", "wind_east", "wind_speed", "wind_from"} & set(c):
         still = np.zeros(len(table.lines))  # no wind is known there but by models
         return still, still
     needs = "wind_n_mps and wind_e_mps, or wind speed and direction from"
-    gate.refuse(f"{SOURCE}: {table.path}: line 1: needs {needs}", "table-column-missing")
+    gate.refuse(f"{SOURCE}: {table.path}: line 1: needs {needs}", "column-missing")
     return None
 
 
@@ -756,7 +751,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
     if not whole.all():
         k, count = int(np.argmin(whole)), int((~whole).sum())
         words = f"{count} rows with a missing value left out, the first at line {int(table.lines[k])}"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="rows-incomplete"))
+        gate.findings.append(Issue(words, "rows-left-out", SOURCE))
     rows = np.flatnonzero(whole)[np.argsort(c["alt"][whole], kind="stable")]
     alt, rho, temperature = c["alt"][rows], c["rho"][rows], c["temperature"][rows]
     if len(rows) < 2:
@@ -764,20 +759,18 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
         return None
     if (np.diff(alt) <= 0).any():
         k = int(rows[int(np.argmax(np.diff(alt) <= 0)) + 1])
-        gate.refuse(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row", "altitude-twice")
+        gate.refuse(f"{table.at(k)}: altitude {c['alt'][k]:.1f} m stands twice; keep one row", "rows-contradict")
         return None
     if alt[-1] < LOWEST_TOP_M:
         words = f"ends at {alt[-1] / 1000:.1f} km: above it the standard atmosphere is blended in, winds fade to zero"
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="sounding-short"))
+        gate.findings.append(Issue(words, "sounding-short", SOURCE))
     pressure = rho * gas_constant(alt, planet) * temperature
     if "pressure" in c:
         off = np.abs(c["pressure"][rows] / pressure - 1.0)
         if np.nanmax(off, initial=0.0) > GAS_LAW_TOLERANCE:
             k = int(rows[int(np.nanargmax(off))])
             words = f"pressure departs from density and temperature by {100 * np.nanmax(off):.0f} % at line "
-            gate.findings.append(
-                Finding(SOURCE, f"{words}{int(table.lines[k])}; density is used", np.nan, np.nan, code="gas-law")
-            )
+            gate.findings.append(Issue(f"{words}{int(table.lines[k])}; density is used", "sounding-balance", SOURCE))
     out_of_balance = hydrostatic_error(alt, pressure, temperature) if planet == earth.WGS84 else 0.0
     if abs(out_of_balance) > HYDROSTATIC_TOLERANCE:
         size, side = 100.0 * abs(out_of_balance), "high" if out_of_balance > 0.0 else "low"
@@ -785,7 +778,7 @@ def _ordered(gate: Gate, table: Table, winds: tuple[FloatArray, FloatArray], pla
             f"temperatures are up to {size:.0f} % too {side} for the fall of density with height (hydrostatic "
             "balance): check the units of all three"
         )
-        gate.findings.append(Finding(SOURCE, words, np.nan, np.nan, code="hydrostatic-balance"))
+        gate.findings.append(Issue(words, "sounding-balance", SOURCE))
     density_sd, wind_sd = default_sounding_sd(alt, planet)
     for key, default in (("rho_sd", density_sd), ("wind_sd", wind_sd)):
         if key in c:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, nearest_name
 from flightmodel.geometry import FEATURE_KINDS, ListedFeatures, ShellGeometry, revolved, torus_circles
 from flightmodel.mesh_sections import nearest_on_sections
 from flightmodel.tables import line_of, numbers, read_table
@@ -56,7 +56,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
     if missing:
         hints = "; ".join(f"no column '{name}'{nearest_name(name, list(frame.columns))}" for name in missing)
         raise GateError(f"{label}: {path}: {hints}; wanted are {', '.join(COLUMNS)}", code="column-missing")
-    faults: list[str] = []
+    faults: list[Issue] = []
     station, radius, clock, width = (numbers(frame, name, path, label, faults) for name in NUMBERS)
     kind = _words(frame, "kind", FEATURE_KINDS, path, faults)
     shade = _words(frame, "shade", SHADES, path, faults)
@@ -73,9 +73,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
                 row = int(np.argmin(good))
                 where = f"{label}: {path}: line {line_of(frame, row)}, column '{column}'"
                 count = int((~good).sum())
-                faults.append(
-                    Fault(f"{where}: {frame[column].iloc[row]}: {wanted} ({count} in all)", "feature-off-shell")
-                )
+                faults.append(Issue(f"{where}: {frame[column].iloc[row]}: {wanted} ({count} in all)", "edit-unusable"))
     if faults:
         raise GateError(faults)
     at = np.deg2rad(clock)
@@ -84,7 +82,7 @@ def _listed(frame: pd.DataFrame, path: Path, geometry: ShellGeometry) -> ListedF
 
 
 def _words(
-    frame: pd.DataFrame, column: str, known: tuple[str, ...], path: Path, faults: list[str]
+    frame: pd.DataFrame, column: str, known: tuple[str, ...], path: Path, faults: list[Issue]
 ) -> NDArray[np.int64]:
     """Index of each cell's word among the known ones."""
     cells = frame[column].str.strip()
@@ -92,7 +90,7 @@ def _words(
     if strange.any():
         row = int(np.argmax(strange))
         words = f"geometry.features: {path}: line {line_of(frame, row)}, column '{column}': '{cells.iloc[row]}'"
-        faults.append(Fault(f"{words}: {' or '.join(known)} is wanted ({int(strange.sum())} in all)", "feature-word"))
+        faults.append(Issue(f"{words}: {' or '.join(known)} is wanted ({int(strange.sum())} in all)", "not-a-number"))
         return np.zeros(len(cells), dtype=np.int64)
     return cells.map({word: k for k, word in enumerate(known)}).to_numpy(dtype=np.int64)
 

@@ -5,8 +5,7 @@ declares column and unit (`Source`); nothing is guessed. This is the only place 
 become SI and radians.
 
 Times are numbers in a unit, ISO 8601 in UTC, or IRIG day of year ``DDD:HH:MM:SS.fff``; the latter lie in t0's year, or
-in the next one where that is nearer (a flight across New Year). Cells of the usual width are read many at a time;
-others, one by one, to the same number.
+in the next one where that is nearer (a flight across New Year).
 
 Units have short names in flight.toml and in the names of canonical columns (``_mps2``, ``_degc``); any other text is
 read by the library pint (``"slug/ft^3"``, ``"deg/hr"``, ``"inHg"``), as long as it is the unit of a quantity that a
@@ -27,7 +26,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -35,11 +34,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 from scipy import constants
 
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError, IntArray, nearest_name
-from flightmodel.config import KeyFaults, Section, Time
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue, nearest_name
+from flightmodel.config import KeyFault, Section, Time
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.files import UnfitFile, file_bytes, nothing_at
 
@@ -162,15 +161,7 @@ def _read(text: str) -> Unit | None:
     try:
         unit = registry.parse_units(plain)
         ends = [registry.Quantity(x, unit).to_base_units() for x in (0.0, 1.0)]
-    except (
-        library.errors.PintError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        SyntaxError,
-        AssertionError,
-    ):
+    except (library.errors.PintError, *_UNREADABLE):
         return None
     powers = dict(ends[0].dimensionality)
     found = *(powers.pop(base, 0) for base in _BASES), "radian" in str(ends[1].units)
@@ -188,7 +179,8 @@ def _library() -> tuple[Any, Any]:
     return pint, pint.UnitRegistry()
 
 
-def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+def ordered_spans(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    """Refuse spans of which one does not end after it begins."""
     for start, stop in value:
         if not start < stop:
             raise ValueError(f"a span ends after it begins; {start:g} to {stop:g} s does not")
@@ -196,7 +188,7 @@ def _in_order(value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, floa
 
 
 # first and last second of each
-Spans = Annotated[tuple[tuple[Time, Time], ...], Field(min_length=1, max_length=100), AfterValidator(_in_order)]
+Spans = Annotated[tuple[tuple[Time, Time], ...], Field(min_length=1, max_length=100), AfterValidator(ordered_spans)]
 
 
 class ColumnEntry(Section):
@@ -226,11 +218,10 @@ class TimeEntry(Section):
     offset_s: Annotated[float, Field(ge=-1e10, le=1e10)] = 0.0  # a spacecraft's clock counts from 1980 or 2000
     repeats: Literal["refuse", "first"] = "refuse"
 
-    @model_validator(mode="after")
-    def _three_or_one(self) -> TimeEntry:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if (self.format == "utc_hms") != (self.columns is not None):
-            raise ValueError('format = "utc_hms" and columns = ["hour", "minute", "second"] belong together')
-        return self
+            yield "", None, 'format = "utc_hms" and columns = ["hour", "minute", "second"] belong together'
 
 
 class Source(Section):
@@ -366,9 +357,9 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     except UnfitFile as fault:
         raise GateError(f"{label}: {path}: {fault.strerror}", fault.code) from None
     except (UnicodeDecodeError, OSError) as fault:
-        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="table-unreadable") from None
+        raise GateError(f"{label}: {path}: not a readable CSV table: {fault}", code="file-unreadable") from None
     if "\0" in text:
-        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="table-unreadable")
+        raise GateError(f"{label}: {path}: not a readable CSV table: it holds binary data", code="file-unreadable")
     numbered = [(k, line) for k, line in enumerate(text.splitlines(), start=1) if line.strip()]
     if len(numbered) <= least_rows:
         rows = max(0, len(numbered) - 1)
@@ -379,16 +370,16 @@ def read_table(path: Path, label: str, least_rows: int = 2) -> pd.DataFrame:
     opened = _open_quote(numbered)
     if opened:
         raise GateError(
-            f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it", code="table-quote"
+            f"{label}: {path}: line {opened}: a quote opens and is not closed on the line; mend it", code="row-ragged"
         )
     names, counts = _cells(numbered)
     head = f"{label}: {path}: line {numbered[0][0]}"
-    faults = [Fault(f"{head}: column '{n}' stands twice", "column-twice") for n in _twice(names)]
+    faults = [Issue(f"{head}: column '{n}' stands twice", "given-twice") for n in _twice(names)]
     ragged = np.flatnonzero(counts != len(names))
     if len(ragged):
         k = int(ragged[0])
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: line {lines[k]}: {counts[k]} cells where the header has {len(names)} "
                 f"({len(ragged)} in all); mend or remove them",
                 "row-ragged",
@@ -436,15 +427,12 @@ def line_of(frame: pd.DataFrame, row: int) -> int:
     return int(frame.attrs["lines"][row])
 
 
-def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[str]) -> FloatArray:
+def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: list[Issue]) -> FloatArray:
     """Column as float64; empty and NaN cells are missing, any other text is a fault with its file line."""
     import pandas as pd
 
     text = frame[column].str.strip()
     values = pd.to_numeric(text, errors="coerce").to_numpy(dtype=np.float64, copy=True)
-    read = np.isfinite(values)
-    # pandas 3.0 and before round the last of seventeen digits
-    values[read] = [float(cell) for cell in text.to_numpy(dtype=object)[read]]
     missing = text.str.lower().isin(["", "nan", "na", "null", "-"]).to_numpy()
     bad = (~np.isfinite(values)) & ~missing
     if bad.any():
@@ -452,7 +440,7 @@ def numbers(frame: pd.DataFrame, column: str, path: Path, label: str, faults: li
         where = f"{label}: {path}: line {line_of(frame, first)}, column '{column}'"
         count = f"({int(bad.sum())} in all)"
         faults.append(
-            Fault(
+            Issue(
                 f"{where}: '{text.iloc[first]}' is no finite number {count}; leave a missing value empty",
                 "not-a-number",
             )
@@ -502,7 +490,7 @@ def column_si(
     declared: Declared | None,
     path: Path,
     label: str,
-    faults: list[str],
+    faults: list[Issue],
 ) -> FloatArray | None:
     """Return a quantity in SI, or None where it is absent (a fault when it is required)."""
     column, unit = place(quantity, declared)
@@ -513,7 +501,7 @@ def column_si(
     if not fits(quantity, unit):
         fitting = ", ".join(u for u, (kind, _, _) in UNITS.items() if kind == quantity.kind)
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: column '{column}': unit '{unit}' is not one of {quantity.kind}: {fitting}",
                 "unit-unknown",
             )
@@ -522,7 +510,7 @@ def column_si(
     return to_si(numbers(frame, column, path, label, faults), unit)
 
 
-def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> str:
+def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, label: str) -> Issue:
     stem = column.rsplit("_", 1)[0]
     bare = [c for c in frame.columns if c.lower() in (stem.lower(), quantity.short.lower())]
     if bare:
@@ -533,11 +521,11 @@ def _absent(frame: pd.DataFrame, quantity: Quantity, column: str, path: Path, la
     else:
         hint = nearest_name(column, frame.columns)
     words = f"{label}: {path}: line 1: no column '{column}'{hint}; found {', '.join(frame.columns)}"
-    return Fault(words, "table-column-missing")
+    return Issue(words, "column-missing")
 
 
 def unordered_times_s(
-    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[Issue]
 ) -> FloatArray | None:
     """Seconds after t0 in the file's order, or None with a fault for each thing that is wrong."""
     absent = [column for column in spec.parts if column not in frame.columns]
@@ -545,7 +533,7 @@ def unordered_times_s(
         found = ", ".join(frame.columns)
         hint = nearest_name(absent[0], frame.columns)
         faults.append(
-            Fault(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "table-column-missing")
+            Issue(f"{label}: {path}: line 1: no time column '{absent[0]}'{hint}; found {found}", "column-missing")
         )
         return None
     if spec.format == "seconds":
@@ -560,15 +548,15 @@ def unordered_times_s(
         cell = ":".join(frame[column].iloc[first].strip() for column in spec.parts)
         where = f"{label}: {path}: line {line_of(frame, first)}: time '{cell}'"
         if _SECOND_60.search(cell):
-            faults.append(Fault(f"{where} {SECOND_60}", "second-60"))
+            faults.append(Issue(f"{where} {SECOND_60}", "time-format"))
         else:
-            faults.append(Fault(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
+            faults.append(Issue(f"{where} is not in format '{spec.format}' ({int(bad.sum())} in all)", "time-format"))
         return None
     return values
 
 
 def times_s(
-    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[str]
+    frame: pd.DataFrame, spec: TimeColumn, t0: datetime, path: Path, label: str, faults: list[Issue]
 ) -> FloatArray | None:
     """Seconds after t0, strictly increasing, or None with a fault for each thing that is wrong."""
     values = unordered_times_s(frame, spec, t0, path, label, faults)
@@ -579,7 +567,7 @@ def times_s(
     if back.any():
         k = int(np.argmax(back))
         faults.append(
-            Fault(
+            Issue(
                 f"{label}: {path}: line {line_of(frame, k + 1)}: time runs backwards or repeats: {values[k]:.6f} s "
                 f"then {values[k + 1]:.6f} s ({int(back.sum())} in all); sort the rows or remove the duplicates",
                 "time-backwards",
@@ -606,7 +594,6 @@ SECOND_60 = (
     'the times of every table as seconds after t0 (format = "seconds")'
 )
 _IRIG = re.compile(r"^(\d{1,3}):(\d{2}):(\d{2}):(\d{2}(?:\.\d*)?)$", re.ASCII)
-_COLONS, _POINT, _WIDEST = [3, 6, 9], 12, 22  # where the usual form has them; so many digits are exact in float64
 HALF_YEAR_S = 183 * 86400.0
 
 
@@ -624,42 +611,9 @@ def clock_times(cells: Sequence[str], form: str, t0: datetime) -> FloatArray:
 
 
 def _irig_times(cells: Sequence[str], t0: datetime) -> FloatArray:
-    out = np.full(len(cells), np.nan)
-    widths = np.array([len(cell) for cell in cells])
-    for width in np.unique(widths).tolist():
-        rows = np.flatnonzero(widths == width)
-        usual = np.zeros(len(rows), dtype=bool)
-        if _POINT <= width <= _WIDEST:
-            try:
-                table = np.array([cells[k] for k in rows.tolist()], dtype=f"S{width}")
-            except UnicodeEncodeError:
-                table = np.full(len(rows), b"?" * width)
-            usual, seconds = _usual_irig(table.view(np.uint8).reshape(-1, width), t0)
-            out[rows[usual]] = seconds
-        for k in rows[~usual].tolist():
-            match = _IRIG.match(cells[k])
-            if match:
-                day, hour, minute = (np.array([float(match[part])]) for part in (1, 2, 3))
-                out[k] = _seconds(day, hour, minute, np.array([float(match[4])]), t0)[0]
-    return out
-
-
-def _usual_irig(table: np.ndarray, t0: datetime) -> tuple[np.ndarray, FloatArray]:
-    """Which rows of characters have the usual form, and their seconds after t0."""
-    width = table.shape[1]
-    marks = [*_COLONS, _POINT] if width > _POINT else _COLONS
-    digits = np.delete(table, marks, axis=1).astype(np.int64) - ord("0")
-    usual = np.all(table[:, _COLONS] == ord(":"), axis=1) & np.all((digits >= 0) & (digits <= 9), axis=1)
-    if width > _POINT:
-        usual &= table[:, _POINT] == ord(".")
-    digits = digits[usual]
-
-    def number(first: int, last: int) -> FloatArray:
-        return (digits[:, first:last] @ 10 ** np.arange(last - first - 1, -1, -1)).astype(float)
-
-    last = digits.shape[1]
-    second = number(7, last) / 10.0 ** (last - 9)
-    return usual, _seconds(number(0, 3), number(3, 5), number(5, 7), second, t0)
+    rows = [cell if _IRIG.match(cell) else "nan:nan:nan:nan" for cell in cells]
+    day, hour, minute, second = np.loadtxt(rows, delimiter=":", ndmin=2).T
+    return _seconds(day, hour, minute, second, t0)
 
 
 def _seconds(day: FloatArray, hour: FloatArray, minute: FloatArray, second: FloatArray, t0: datetime) -> FloatArray:
@@ -685,11 +639,10 @@ class ThinnedSpan(Section):
     to_s: Time | None = None
     components: tuple[Component, ...] = ()
 
-    @model_validator(mode="after")
-    def _in_order(self) -> ThinnedSpan:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.from_s is not None and self.to_s is not None and self.to_s <= self.from_s:
-            raise KeyFaults([("to_s", self.to_s, f"is not after from_s = {self.from_s:g}; swap the two")])
-        return self
+            yield "to_s", self.to_s, f"is not after from_s = {self.from_s:g}; swap the two"
 
     def holds(self, time_s: FloatArray, component: str) -> BoolArray:
         """Which rows (n,) of a component it is about."""

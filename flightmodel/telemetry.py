@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, GateError, check_increasing, check_shape
+from flightmodel.checks import FloatArray, GateError, Issue, check_increasing, check_shape
 from flightmodel.earth import WGS84, Planet
 from flightmodel.instruments import BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
 from flightmodel.tables import ThinnedSpan
@@ -349,29 +349,6 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Finding:
-    """Something in the data that an analyst should know; never an error and never repaired in silence.
-
-    Times are NaN where it is not about a time. ``code`` is short and stable (``"data-gap"``); ``what`` may be reworded.
-    """
-
-    source: str
-    what: str
-    start_s: float
-    end_s: float
-    code: str = ""
-
-    def __str__(self) -> str:
-        """One line for tables and logs."""
-        if not np.isfinite(self.start_s):
-            return f"{self.source}: {self.what}"
-        where = (
-            f"at {self.start_s:.3f} s" if self.end_s == self.start_s else f"{self.start_s:.3f} to {self.end_s:.3f} s"
-        )
-        return f"{self.source}: {self.what} ({where})"
-
-
-@dataclass(frozen=True)
 class Telemetry:
     """Everything measured on one flight, plus what the analyst states about vehicle, start and motion.
 
@@ -392,7 +369,7 @@ class Telemetry:
     magnetometer: TriadRecord | None = None
     sun: SunRecord | None = None
     events: tuple[tuple[str, float], ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Issue, ...] = ()
     hashes: dict[str, str] = field(default_factory=dict)
     gnss: dict[str, GnssRecord] = field(default_factory=dict)
     barometers: dict[str, BarometerRecord] = field(default_factory=dict)

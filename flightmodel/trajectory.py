@@ -135,7 +135,7 @@ def resample(trajectory: Trajectory, time_s: FloatArray) -> Trajectory:
     at = np.asarray(time_s, dtype=float)
     if at.min() < t[0] - 1e-9 or at.max() > t[-1] + 1e-9:
         raise GateError(
-            f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s", code="time-range"
+            f"resample: {at.min():.3f} to {at.max():.3f} s lies outside {t[0]:.3f} to {t[-1]:.3f} s", code="table-range"
         )
     at = np.clip(at, t[0], t[-1])
     from scipy.interpolate import CubicHermiteSpline  # half a second to import
@@ -198,7 +198,7 @@ def difference(estimate: Trajectory, truth: Trajectory) -> FloatArray:
     if estimate.point != truth.point or not np.allclose(estimate.time_s, truth.time_s, atol=1e-9, rtol=0.0):
         raise GateError(
             "difference: the trajectories follow different points or times; resample or move one first",
-            code="trajectories-differ",
+            code="argument-value",
         )
     return np.hstack(
         [

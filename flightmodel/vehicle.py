@@ -13,22 +13,22 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel.aerodynamics import Aerodynamics, AeroTable, Coefficient, Shape, aerodynamics_from
-from flightmodel.checks import ConfigError, Fault, FloatArray, check_positive_definite, check_type, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, Issue, check_positive_definite, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     ErrorAngle,
     Fraction,
-    KeyFaults,
+    KeyFault,
     Label,
     Length,
     Name,
     Place,
     Section,
     Time,
-    check_one_of,
+    one_of,
     read_section,
 )
 from flightmodel.deflection import lv_direction
@@ -107,12 +107,11 @@ class MassStep(Section):
     aeroshell: MassProperties | None = None
     centerbody: MassProperties | None = None
 
-    @model_validator(mode="after")
-    def _whole(self) -> MassStep:
-        check_one_of(self, "from_s", "event")
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        yield from one_of(self, "from_s", "event")
         if self.aeroshell is None and self.centerbody is None:
-            raise ValueError("the body that changes is wanted: aeroshell, centerbody or both")
-        return self
+            yield "", None, "the body that changes is wanted: aeroshell, centerbody or both"
 
 
 class CompliantJoint(Section):
@@ -141,19 +140,14 @@ class CompliantJoint(Section):
     creep_share: Annotated[float, Field(ge=0.0, le=0.9)] = 0.0
     creep_time_s: Annotated[float, Field(ge=0.1, le=1e4)] = 10.0
 
-    @model_validator(mode="after")
-    def _spring_to_creep(self) -> CompliantJoint:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.creep_share > 0.0 and self.bending_stiffness_nmprad == 0.0:
-            raise KeyFaults([("creep_share", self.creep_share, "a joint without bending stiffness has none; 0")])
-        return self
-
-    @model_validator(mode="after")
-    def _spring_that_rises(self) -> CompliantJoint:
+            yield "creep_share", self.creep_share, "a joint without bending stiffness has none; 0"
         least = -np.sqrt(3.0 * self.bending_stiffness_nmprad * self.hardening_nmprad3)
         if self.quadratic_nmprad2 < min(least, 0.0):
             words = f"the moment would fall with the angle; at least -sqrt(3 K1 K3) = {least:.4g} is wanted"
-            raise KeyFaults([("quadratic_nmprad2", self.quadratic_nmprad2, words)])
-        return self
+            yield "quadratic_nmprad2", self.quadratic_nmprad2, words
 
     @property
     def delayed_compliance_radpnm(self) -> float:
@@ -225,11 +219,10 @@ class AeroTerms(Section):
     roll_share: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.0
     roll_clock_lv_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
 
-    @model_validator(mode="after")
-    def _whole(self) -> AeroTerms:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if (self.roll_order == 0) != (self.roll_share == 0.0):
-            raise ValueError("roll_order (1 or more) and roll_share are wanted together")
-        return self
+            yield "", None, "roll_order (1 or more) and roll_share are wanted together"
 
     @property
     def numbers(self) -> FloatArray:
@@ -321,14 +314,13 @@ class CameraMount(Section):
             }
         )
 
-    @model_validator(mode="after")
-    def _all_coefficients(self) -> CameraMount:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         count, lens = len(self.distortion), self.lens
         wanted = "k1, k2, k3, k4" if lens == "fisheye" else "k1, k2, p1, p2 or k1, k2, p1, p2, k3"
         if count != 4 and not (lens == "pinhole" and count == 5):
             words = f"the coefficients of a {lens} lens, {wanted}, are wanted; write 0 for those that it has not"
-            raise KeyFaults([("distortion", list(self.distortion), words)])
-        return self
+            yield "distortion", list(self.distortion), words
 
 
 class VehicleFile(Section):
@@ -349,20 +341,14 @@ class VehicleFile(Section):
     sensors: dict[Name, SensorMount] = {}
     cameras: dict[Name, CameraMount] = {}
 
-    @model_validator(mode="after")
-    def _one_shape(self) -> VehicleFile:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         cone, shell = self.aerodynamics.sphere_cone, self.geometry
-        if cone is None:
-            return self
-        faults: list[tuple[str, object, str]] = []
-        for key in ("half_angle_deg", "nose_radius_m", "base_radius_m"):
+        for key in ("half_angle_deg", "nose_radius_m", "base_radius_m") if cone is not None else ():
             flown, drawn = getattr(cone, key), getattr(shell, key)
             if abs(flown - drawn) > SAME_SHAPE * drawn:
                 words = f"geometry.{key} = {drawn:g} of the same shell; within {100 * SAME_SHAPE:.0f} % is wanted"
-                faults.append((f"aerodynamics.sphere_cone.{key}", flown, words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+                yield f"aerodynamics.sphere_cone.{key}", flown, words
 
 
 @dataclass(frozen=True, eq=False)  # as `flightmodel.film.Frames`
@@ -416,14 +402,14 @@ class Vehicle:
         Raises
         ------
         ConfigError
-            ``event-unknown``: a step names an event that is not among ``events``.
+            ``name-unknown``: a step names an event that is not among ``events``.
         """
-        times, faults, steps = dict(events), list[Fault](), list[MassStep]()
+        times, faults, steps = dict(events), list[Issue](), list[MassStep]()
         for step in self.mass_steps:
             if step.event is not None and step.event not in times:
                 hint = f"{nearest_name(step.event, list(times))}; known: {', '.join(times) or 'none'}"
                 words = f"{self.source}: key 'mass.event' = '{step.event}': the flight has no such event{hint}"
-                faults.append(Fault(words, "event-unknown"))
+                faults.append(Issue(words, "name-unknown"))
             else:
                 at_s = step.from_s if step.event is None else times[step.event]
                 steps.append(step.model_copy(update={"from_s": at_s, "event": None}))
@@ -489,15 +475,24 @@ class Vehicle:
 
 def vehicle_path(name: str, beside: Path | None = None) -> Path:
     """Find a vehicle file: a path (relative to ``beside``), or the name of a vehicle that ships with the toolkit."""
+    return path_of("vehicle", name, "name-unknown", beside)
+
+
+def shipped(kind: str) -> list[str]:
+    """Names of the vehicles or scenarios that ship with the toolkit."""
+    return sorted(path.stem for path in (DATA / f"{kind}s").glob("*.toml"))
+
+
+def path_of(kind: str, name: str, code: str, beside: Path | None = None) -> Path:
+    """Find a file of a kind (vehicle, scenario): its path, or the name of a shipped one; refuse others with a code."""
     if "\0" in name:
-        raise ConfigError(f"vehicle {name!r}: a path holds no NUL character", code="path-nul")
+        raise ConfigError(f"{kind} {name!r}: a path holds no NUL character", code="path-refused")
     if name.endswith(".toml"):
         return (beside or Path()) / name
-    shipped = [p.stem for p in (DATA / "vehicles").glob("*.toml")]
-    if name not in shipped:
-        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no vehicle '{name}'{hint}", code="vehicle-unknown")
-    return DATA / "vehicles" / f"{name}.toml"
+    if name not in shipped(kind):
+        hint = f"{nearest_name(name, shipped(kind))}; shipped: {', '.join(shipped(kind))}; a path ends in .toml"
+        raise ConfigError(f"no {kind} '{name}'{hint}", code=code)
+    return DATA / f"{kind}s" / f"{name}.toml"
 
 
 def read_vehicle(name: str | Path) -> Vehicle:
@@ -535,11 +530,11 @@ def vehicle_from_toml(path: Path) -> Vehicle:
     beside = [*listed, *drawn, *((table, str(Path(table).with_suffix(".toml"))) if table is not None else ())]
     if out := [name for name in beside if leads_outside(path.parent, name)]:
         words = "leads out of the vehicle file's folder; copy the file there"
-        raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-outside-folder")
+        raise ConfigError([f"{path.parent / name}: {words}" for name in out], code="path-refused")
     own = table is not None and (path.parent / table).exists()
     if own and table is not None and (path.parent / table).with_suffix(".toml").resolve() == path.resolve():
         words = f"key 'aerodynamics.table' = '{table}': its sidecar would be this vehicle file; rename the table"
-        raise ConfigError(f"{path}: {words}", code="sidecar-is-vehicle")
+        raise ConfigError(f"{path}: {words}", code="keys-conflict")
     aero, table_sd = aerodynamics_from(spec.aerodynamics, shape, (path.parent, DATA / "aerodynamics"))
     lenses = {name: camera.position_m for name, camera in spec.cameras.items()}
     meshes = body_meshes(spec.meshes, path.parent, shell, lenses)

@@ -42,7 +42,7 @@ if not (folder / "flight.toml").exists():
 
 # %%
 flight = pf.read_flight(folder)
-print(*flight.findings, sep="\n")
+print(*(finding.line for finding in flight.findings), sep="\n")
 flight
 
 # %% [markdown]

@@ -71,7 +71,7 @@ def height(position):
 
 # %%
 prometheus = flight("rocketpy_prometheus")
-print(*prometheus.findings, sep="\n")
+print(*(finding.line for finding in prometheus.findings), sep="\n")
 bet = pf.reconstruct(prometheus)
 pd.DataFrame([vars(v) for v in bet.consistency_checks])[["name", "value", "low", "high", "passed"]]
 

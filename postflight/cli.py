@@ -7,8 +7,6 @@ The commands ``postflight montecarlo`` and ``postflight study``: many flights at
 from __future__ import annotations
 
 import _thread
-import atexit
-import gc
 import os
 import signal
 import sys
@@ -23,28 +21,23 @@ from typing import Any, Literal, NamedTuple
 
 import click
 
-from postflight.streams import close_streams, leave_arrow_out, open_streams, pin_threads, write_out
+from postflight.streams import close_streams, open_streams, pin_threads, write_out
 
-# heavy imports stand inside the commands, so that --help answers at once; they make hundred thousands of objects, in
-# which five hundred searches for garbage find none: an eighth of the time of loading, here and in the second process
-gc.set_threshold(50_000, 20, 100)
-# at its end the interpreter would search them all once more, for 0.4 s
-atexit.register(gc.freeze)
+# heavy imports stand inside the commands, so that --help answers at once
 FOLDER = click.Path(path_type=Path)
 
 
 class Computing(click.Command):
-    """A command that loads pandas; its help does not."""
+    """A command that knows when it began."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Load pandas without Arrow, then run the command; its ``obj`` is when that began."""
+        """Run the command; its ``obj`` is when that began."""
         ctx.obj = time.perf_counter()
-        leave_arrow_out()
         return super().invoke(ctx)
 
 
 class Commands(click.Group):
-    """Commands, all of which load pandas."""
+    """Commands of this kind."""
 
     command_class = Computing
 
@@ -90,18 +83,11 @@ def workers_and_scheduler(command: Callable[..., None]) -> Callable[..., None]:
     "--until-width", metavar="OUTPUT=WIDTH", help="Stop once the 97.7th percentile's 95 % interval is this narrow."
 )
 @workers_and_scheduler
-def montecarlo_run(
-    dispersions: str,
-    folder: Path,
-    flights: int | None,
-    until_width: str | None,
-    workers: int | None,
-    scheduler: str | None,
-) -> None:
+def montecarlo_run(**options: Any) -> None:
     """Fly what is missing of DISPERSIONS in FOLDER, then write percentiles, intervals and bands."""
     from postflight.montecarlo import commands
 
-    commands.run(dispersions, folder, flights, workers, scheduler, until_width)
+    commands.run(**options)
 
 
 @montecarlo.command(name="status")
@@ -132,22 +118,6 @@ def montecarlo_retry_failed(folder: Path, workers: int | None, scheduler: str | 
     commands.retry_failed(folder, workers, scheduler)
 
 
-@montecarlo.command(name="sobol")
-@click.argument("dispersions")
-@click.argument("folder", type=FOLDER)
-@click.option("--output", default="peak_deflection_deg", show_default=True, help="Whose indices are printed and drawn.")
-@click.option("--base", type=int, default=256, show_default=True, help="Points of the design, a power of two.")
-@click.option("--by", type=NamedChoice(["factor", "section"]), default="section", show_default=True)
-@workers_and_scheduler
-def montecarlo_sobol(
-    dispersions: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
-) -> None:
-    """Say which dispersion of DISPERSIONS makes an output uncertain: Sobol indices, BASE x (columns + 2) flights."""
-    from postflight.montecarlo import commands
-
-    commands.sobol_indices(dispersions, folder, output, base, by, workers, scheduler)
-
-
 @click.group(cls=Commands)
 def study() -> None:
     """The paper's own studies, as tables and figures beside its numbers."""
@@ -165,12 +135,9 @@ def study_table_3_1(folder: Path, vehicle: str) -> None:
 
 def scenario_and_seed(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that say what is flown."""
-    command = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")(
-        command
-    )
-    return click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")(
-        command
-    )
+    seed = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the day.")
+    scenario = click.option("--scenario", default="irve2_reference", show_default=True, help="A name, or a .toml file.")
+    return scenario(seed(command))
 
 
 @study.command(name="damping")
@@ -180,7 +147,7 @@ def study_damping(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack with 0.5 to 20 % damping at 2.5 Hz (Figure 3.1), into FOLDER."""
     from postflight.studies import commands
 
-    commands.damping(scenario, folder, seed)
+    commands.joint_study("damping", scenario, folder, seed)
 
 
 @study.command(name="stiffness")
@@ -190,7 +157,7 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
     """Angle of attack and normal acceleration from 2 to 4 Hz at 0.5 % (Figures 3.2, 3.3), into FOLDER."""
     from postflight.studies import commands
 
-    commands.stiffness(scenario, folder, seed)
+    commands.joint_study("stiffness", scenario, folder, seed)
 
 
 @study.command(name="shell-test")
@@ -207,13 +174,11 @@ def study_stiffness(folder: Path, scenario: str, seed: int) -> None:
 @click.option(
     "--arm-m", type=click.FloatRange(min=0.0, min_open=True), help="Arm about the joint of force and displacement."
 )
-def study_shell_test(
-    table: Path, folder: Path, time: str, load: str, displacements: tuple[str, ...], arm_m: float | None
-) -> None:
+def study_shell_test(**options: Any) -> None:
     """Which joint has a shell by its load test on the ground (TABLE, a CSV of load and displacement)? Into FOLDER."""
     from postflight.studies import commands
 
-    commands.shell_test(table, folder, time, load, displacements, arm_m)
+    commands.shell_test(**options)
 
 
 @study.command(name="preflight")
@@ -227,10 +192,6 @@ def study_preflight(flight: Path, folder: Path, dispersions: str, flights: int, 
     from postflight.studies import commands
 
     commands.preflight(flight, folder, dispersions, flights, seed)
-
-
-# heavy imports stand inside the commands, so that --help answers at once
-EXIT_INTERRUPTED, EXIT_TERMINATED = 130, 143
 
 
 class FiniteRange(click.FloatRange):
@@ -335,21 +296,15 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option(
-    "--method",
-    "methods",
-    type=NamedChoice(["camera", "misalignment", "trim", "fused"]),
-    multiple=True,
+    "--method", "methods", type=NamedChoice(["camera", "misalignment", "trim", "fused"]), multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
-)
+)  # fmt: skip
 @click.option(
-    "--plane",
-    type=FiniteRange(-360.0, 360.0),
+    "--plane", type=FiniteRange(-360.0, 360.0),
     help="Assume this plane for the camera (LV clocking, deg); default: find it.",
-)
+)  # fmt: skip
 @click.option(
-    "--joint",
-    type=FiniteRange(0.0),
-    help="Assume the joint this far aft of the nose, m; default: the vehicle file's.",
+    "--joint", type=FiniteRange(0.0), help="Assume the joint this far aft of the nose, m; default: the vehicle file's."
 )
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
 def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
@@ -413,7 +368,7 @@ def noise(folder: Path, accept: bool) -> None:
 @click.option("--hardening", is_flag=True, help="Ask whether the spring hardens (or softens) with the angle.")
 @click.option("--freeplay", is_flag=True, help="Ask whether the joint has freeplay.")
 @click.option("--creep", is_flag=True, help="Ask whether part of the joint's compliance comes late.")
-@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee), evidence by dynesty.")
+@click.option("--posterior", is_flag=True, help="Sample the posterior (emcee).")
 def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, posterior: bool) -> None:
     """Find the joint that makes the simulator fly like the flight in FOLDER: stiffness, damping, offset, stability."""
     from postflight.reconciliation import command
@@ -437,11 +392,9 @@ def score(folder: Path, as_json: bool, wanted: str | None) -> None:
 @click.option("--output", type=click.Path(dir_okay=False, path_type=Path), help="Default: in the run's folder.")
 @click.option("--notebook", is_flag=True, help="Write a Jupyter notebook filled in for this flight instead.")
 @click.option(
-    "--bands",
-    multiple=True,
-    type=click.Path(exists=True, path_type=Path),
+    "--bands", multiple=True, type=click.Path(exists=True, path_type=Path),
     help="Folder of a Monte Carlo study or a reconciliation to hold the flight against.",
-)
+)  # fmt: skip
 @of_run
 def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path, ...], wanted: str | None) -> None:
     """Write the report of a run, the last complete one, of the flight in FOLDER: one HTML file, no network needed."""
@@ -452,10 +405,8 @@ def report(folder: Path, output: Path | None, notebook: bool, bands: tuple[Path,
     if notebook and bands:
         raise click.UsageError("--bands belongs to the report in HTML; leave out --notebook")
     run = find_run(folder, wanted)
-    if notebook:
-        write_out(f"report in {write_notebook(folder, output, run)}\n")
-    else:
-        write_out(f"report in {write_report(folder, run, target=output, studies=bands)}\n")
+    written = write_notebook(folder, output, run) if notebook else write_report(folder, run, None, output, bands)
+    write_out(f"report in {written}\n")
 
 
 @cli.command()
@@ -543,14 +494,13 @@ cli.add_command(montecarlo)
 cli.add_command(study)
 
 
-_AGAIN_S = 0.02  # after which a signal that came where nothing may be raised is tried again
 _BINDINGS = f"{os.sep}llvmlite{os.sep}binding{os.sep}"
 
 
 def terminate(number: int, frame: FrameType | None) -> None:
     """Leave as after Ctrl-C, so that what is half-written is removed; exit code as the shell gives it."""
     if not _postponed(number, frame):
-        sys.exit(EXIT_TERMINATED)
+        sys.exit(143)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -581,7 +531,7 @@ def unraisable(lost: Any) -> None:
 
 
 def _try_again(number: int) -> None:
-    again = threading.Timer(_AGAIN_S, _send_again, (number,))
+    again = threading.Timer(0.02, _send_again, (number,))
     again.daemon = True
     again.start()
 
@@ -610,7 +560,7 @@ def main() -> None:
         sys.exit(stop.exit_code)
     except (click.exceptions.Abort, KeyboardInterrupt):
         write_out("interrupted; nothing half-written is left\n", sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(130)
     except click.ClickException as fault:
         fault.show()
         sys.exit(fault.exit_code)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,25 +21,26 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel.camera import Lens
-from flightmodel.checks import NO_FAULT, ConfigError, DivergenceError, Fault, FloatArray, GateError, Progress
+from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from postflight import run_folder, warmup
+from postflight.beside import Beside, Task, same
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
 from postflight.scoring import PUBLISHED_DEG, Score, score_run
-from postflight.second_process import SecondProcess
 from postflight.sensitivity import largest_of_groups, sensitivity
-from postflight.streams import return_large_arrays, write_out
+from postflight.streams import write_out
 from postflight.studies.preflight import Bounds, entry_bounds
 from postflight.terminal import few_of_each, progress_bar, terminal
-from recon.consistency import ConsistencyCheck
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
 
 if TYPE_CHECKING:
+    from estimators.camera import FilmFit
+    from estimators.fusing import CameraTimeBias
     from postflight.filming import CameraAnswer
 
 EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
@@ -48,6 +50,7 @@ SHORT = {
 }  # fmt: skip
 LARGEST_NORMAL = 3.5  # standard deviations that one of some dozens of changes may be off
 REFERENCE = "irve2_reference"
+FIGURES = "postflight.plots.run_figures"
 console = terminal()
 console_err = terminal(stderr=True)
 
@@ -55,7 +58,14 @@ console_err = terminal(stderr=True)
 def compile_kernels(*groups: str) -> None:
     """Compile before first use, and say so."""
     _say_once(warmup.CACHE.remark)
-    warmup.prepare(groups, lambda words: console_err.print(escape(words)))
+    if not (wanted := warmup.missing(groups)):
+        return
+    console_err.print(f"compiling kernels for this machine, once (one to two minutes): {', '.join(wanted)}")
+    with progress_bar() as report:
+        failed = warmup.prepare(wanted, report)
+    for group, reason in failed.items():
+        words = f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}"
+        console_err.print(escape(words))
 
 
 @cache
@@ -175,6 +185,25 @@ def run(
         sys.exit(EXIT_NO_ANSWER)
 
 
+class _Figures:
+    """Figures of a run, drawn beside it; ``bet`` is the task that has its trajectory."""
+
+    bet: Task[Reconstruction]
+
+    def __init__(self, beside: Beside, folder: Path) -> None:
+        self._beside, self._folder = beside, folder
+        self._parts: list[Task[None]] = []
+
+    def draw(self, part: str, *arguments: Any) -> None:
+        """Let a function draw_... of `postflight.plots.run_figures` be called."""
+        self._parts.append(self._beside.submit(f"{FIGURES}:draw_{part}", self.bet, self._folder, *arguments))
+
+    def wait(self) -> None:
+        """Wait until all are drawn; OSError where a file cannot be written."""
+        for part in self._parts:
+            part.result()
+
+
 def run_flight(
     folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False,
     show_answers: Callable[[Reconstruction, Deflections, pd.DataFrame], None] = lambda *_: None,
@@ -183,7 +212,7 @@ def run_flight(
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
 
     ``show_answers`` is called with trajectory, deflections and events before tables and report are written. The film is
-    read and figures are drawn by a second process as soon as their numbers are there.
+    read and figures are drawn beside it as soon as their numbers are there.
     """
     log: list[str] = []
     stages = stages or Stages()
@@ -199,8 +228,8 @@ def run_flight(
 
         return step
 
-    return_large_arrays()  # a reconciliation's, made anew at every step, would cost more time than they are worth
-    with SecondProcess(draws=True) as second:
+    with Beside() as beside:
+        beside.submit(import_module, "postflight.filming" if "camera" in methods else FIGURES)  # it starts meanwhile
         with progress_bar() as report:
             flight = asked_for.of(read_flight(folder, steps(report)(0.0, 0.05)))
         stages.end("reading telemetry")
@@ -208,15 +237,17 @@ def run_flight(
         if flight.changes:
             settings["changes"] = list(flight.changes)
         new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
-        with new as out, closing(second):
+        with new as out, closing(beside):
             with progress_bar() as report:
-                bet, answers = _answered(flight, methods, out.path / "figures", steps(report), stages, second)
+                figures = _Figures(beside, out.path / "figures")
+                bet, answers = _answered(flight, methods, figures, steps(report), stages, beside)
             event_rows = run_folder.event_table(bet, bet.table)
             show_answers(bet, answers, event_rows)
             stages.end("printing the answers")
-            second.draw_deflections(answers)  # not sooner: to hand them over takes a moment
+            figures.draw("deflections", replace(answers, bet=None))  # not sooner: to hand them over takes a moment
             with progress_bar() as report:
                 step = steps(report)
+                step(0.0, 0.1)(0.0, "writing tables")
                 run_folder.write_reconstruction(out, bet, answers)
                 run_folder.write_answers(out, answers)
                 out.keep(run_folder.summary(bet, answers, event_rows))
@@ -227,7 +258,7 @@ def run_flight(
                     run_folder.write_all_checks(out, bet, answers)
                 stages.end("aerodynamic increments")
                 bounds, reran = _write_rest(out, bet, answers, reruns, step)
-                second.draw_studies(bounds, reran, answers.increments)
+                figures.draw("studies", bounds, reran, answers.increments)
                 stages.end("bounds of the rigid vehicle")
                 step(0.9, 1.0)(0.0, "drawing, and writing the report")
                 lines = "".join(json.dumps({"step": k, "what": what}) + "\n" for k, what in enumerate(log))
@@ -236,7 +267,7 @@ def run_flight(
                 with out.part("report"):
                     write_report(folder, out.path, flight.telemetry)
                 stages.end("report")
-                second.finish()
+                figures.wait()
                 stages.end("figures that were not drawn meanwhile")
     for reason in out.left_out:
         console.coded("[yellow]left out[/]", reason, reason.code)
@@ -244,28 +275,34 @@ def run_flight(
 
 
 def _answered(
-    flight: Flight, methods: tuple[str, ...], figures: Path, step: Callable[[float, float], Progress], stages: Stages,
-    second: SecondProcess,
+    flight: Flight, methods: tuple[str, ...], figures: _Figures, step: Callable[[float, float], Progress],
+    stages: Stages, beside: Beside,
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
     """Trajectory, given to be drawn, and deflections; a camera without video is among the methods that were refused."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
+    film: Task[FilmFit] | None = None
     if "camera" in methods and len(flight.telemetry.films) == 1:
-        second.read_film(flight, "fused" in methods)
+        film = beside.keep("postflight.filming:camera_film", flight)
+    beside.submit(import_module, FIGURES)
     bet = reconstruct(flight, None, step(0.05, 0.7))
     stages.end("trajectory")
-    second.draw_trajectory(bet, figures)
+    figures.bet = there = beside.keep(same, bet)
+    camera: Task[CameraAnswer] | None = None
+    time_bias: Task[CameraTimeBias | None] | None = None
+    if film is not None:
+        camera = beside.submit("postflight.filming:answer_of_film", there, film)
+        if "fused" in methods:
+            time_bias = beside.submit("postflight.filming:time_bias_of", there, camera)
     wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
 
-    def camera() -> CameraAnswer | None:
-        _ = bet.table  # while the second process has no answer yet
-        return second.camera()
-
-    answers = estimate(bet, wanted, step(0.7, 1.0), camera, second.time_bias)
+    figures.draw("trajectory")  # which comes after the camera
+    _ = bet.table  # while the camera has no answer yet
+    answers = estimate(bet, wanted, step(0.7, 1.0), camera, time_bias)
     stages.end("deflections")
     if "camera" in methods and "camera" not in wanted:
-        answers.refused["camera"] = Fault("the flight has no video", NO_VIDEO)
+        answers.refused["camera"] = Issue("the flight has no video", NO_VIDEO)
     return bet, answers
 
 
@@ -317,7 +354,7 @@ def asked(
 ) -> Asked:
     """Read ``--set NAME=VALUE`` (the value as TOML writes it) and the other options; every fault at once."""
     changes: dict[str, Any] = {}
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     if run_name is not None:
         try:
             check_name(run_name)
@@ -326,9 +363,9 @@ def asked(
     for text in settings:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and name):
-            faults.append(Fault(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "set-form"))
+            faults.append(Issue(f"--set {text}: NAME=VALUE is wanted, e.g. --set c_n=1.1", "option-format"))
         elif name in changes:
-            faults.append(Fault(f"--set {text}: {name} is set twice; give it once", "set-twice"))
+            faults.append(Issue(f"--set {text}: {name} is set twice; give it once", "given-twice"))
         else:
             changes[name] = _toml_value(value)
     if faults:
@@ -375,7 +412,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         console.coded(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
 
 
-def print_checks(checks: tuple[ConsistencyCheck, ...], of: str) -> None:
+def print_checks(checks: tuple[Check, ...], of: str) -> None:
     """Print how many checks of something pass, and in red those that fail."""
     failed = [check for check in checks if not check.passed]
     console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")
@@ -492,7 +529,7 @@ def deflection(
         except (GateError, DivergenceError) as fault:
             if not alone:
                 raise
-            trouble = Fault(str(fault), fault.codes[0])
+            trouble = Issue(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
         with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
             run_folder.write_answers(out, answers)
@@ -513,7 +550,7 @@ def deflection(
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
     elif film:
         console.coded(
-            "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "film-not-drawn"
+            "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "figure-failed"
         )
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:

@@ -22,7 +22,7 @@ from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR, DeflectionHistory
 from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
-from flightmodel.trajectory import difference, resample
+from flightmodel.trajectory import Trajectory, difference, resample
 from postflight.deflections import METHODS
 from postflight.run_folder import value_and_sd
 from postflight.runs import RunTables, trajectory_of
@@ -30,12 +30,8 @@ from postflight.runs import RunTables, trajectory_of
 Sd = TypeVar("Sd", float, pd.Series)
 MOST_RUNS = 6  # that strokes and colours keep apart
 INDEPENDENT, CORRELATED = "independent", "correlated"
-# quantity, its unit, its column in bet.csv and that of its sd
-_APART = (
-    ("position_m", slice(0, 3), 1.0),
-    ("velocity_mps", slice(3, 6), 1.0),
-    ("attitude_deg", slice(6, 9), 180.0 / np.pi),
-)
+# sizes of the differences of two trajectories, their units, and the scale from SI
+APART = (("position_m", "m", 1.0), ("velocity_mps", "m/s", 1.0), ("attitude_deg", "deg", 180.0 / np.pi))
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,10 @@ class RunComparison(Tabular):
         """One row a run: what it is, then each quantity with its sd, units in the columns' names."""
         rows = []
         for k, run in enumerate(self.runs):
-            row: dict[str, Any] = _about(run) | {"label": self.labels[k], "t_s": self.at_s[k]}
+            row: dict[str, Any] = {
+                "run": run.path.name, "label": self.labels[k], "flight": run.header["flight"],
+                "changes": "; ".join(run.changes), "version": run.facts["version"], "t_s": self.at_s[k],
+            }  # fmt: skip
             for q in self.quantities:
                 row[q.column], row[column_about(q.column, "sd")] = self.value(k, q)
             checks = run.checks["passed"]
@@ -148,9 +147,9 @@ class RunComparison(Tabular):
 
         ``position_m``, ``velocity_mps``, ``attitude_deg`` are sizes of vectors, the others are signed.
         """
-        parts = [_over_time(self.runs[0], run) for run in self.runs[1:]] if self.same_clock else []
-        names = [run.path.name for run in self.runs[1:]] if self.same_clock else []
-        return pd.concat([part.assign(run=name) for part, name in zip(parts, names, strict=True)] or [pd.DataFrame()])
+        if not self.same_clock:
+            return pd.DataFrame()
+        return pd.concat([_over_time(self.runs[0], run).assign(run=run.path.name) for run in self.runs[1:]])
 
     def checks(self) -> pd.DataFrame:
         """One row a check: of each run, by its number, value, limits and whether it passed."""
@@ -171,7 +170,7 @@ def compare_runs(runs: tuple[RunTables, ...]) -> RunComparison:
     Raises
     ------
     ConfigError
-        ``compare-runs`` for fewer than two or too many runs, ``compare-same-run`` where one comes twice.
+        ``compare-runs`` for fewer than two or too many runs, ``given-twice`` where one comes twice.
     """
     if not 2 <= len(runs) <= MOST_RUNS:
         words = f"compare: {len(runs)} run{'s' * (len(runs) != 1)} named; 2 to {MOST_RUNS} are wanted"
@@ -180,7 +179,7 @@ def compare_runs(runs: tuple[RunTables, ...]) -> RunComparison:
     again = sorted({place.name for k, place in enumerate(places) if place in places[:k]})
     if again:
         words = f"compare: {', '.join(again)} is named more than once; name another run, such as FOLDER/plain"
-        raise ConfigError(words, "compare-same-run")
+        raise ConfigError(words, "given-twice")
     return RunComparison(runs, _labels(runs))
 
 
@@ -201,16 +200,6 @@ def _labels(runs: tuple[RunTables, ...]) -> tuple[str, ...]:
     return tuple(
         f"{label} ({run.path.name})" if label in twice else label for run, label in zip(runs, out, strict=True)
     )
-
-
-def _about(run: RunTables) -> dict[str, Any]:
-    return {
-        "run": run.path.name,
-        "label": "",
-        "flight": run.header["flight"],
-        "changes": "; ".join(run.changes),
-        "version": run.facts["version"],
-    }
 
 
 def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
@@ -252,17 +241,17 @@ def _relation(first: RunTables, other: RunTables) -> Relation:
 def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
     """Differences of a run to the first one at the first one's times that both cover, over the pulse and about it."""
     a, b = first.tables["bet"], other.tables["bet"]
-    rows = (a["t_s"] >= b["t_s"].iloc[0]) & (a["t_s"] <= b["t_s"].iloc[-1])
+    rows = a["t_s"].between(b["t_s"].iloc[0], b["t_s"].iloc[-1])
     if rows.sum() < 2:
-        raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "no-common-time")
+        raise GateError(f"{first.path.name} and {other.path.name}: no time in common", "time-not-covered")
     t = a["t_s"][rows].to_numpy(float)
     out = {"t_s": t, "run": ""} | _vectors(a[rows], b)
     for q in TRAJECTORY:
         out[q.column] = np.interp(t, b["t_s"], b[q.column]) - a[q.column][rows].to_numpy(float)
     for method in METHODS:
-        both = [history for run in (first, other) if (history := run.history(method)) is not None]
-        if len(both) == 2:
-            out[f"deflection_{method}_deg"] = _angle_deg(both[1], t) - _angle_deg(both[0], t)
+        own, theirs = first.history(method), other.history(method)
+        if own is not None and theirs is not None:
+            out[f"deflection_{method}_deg"] = _angle_deg(theirs, t) - _angle_deg(own, t)
     return pd.DataFrame(out)
 
 
@@ -277,7 +266,11 @@ def _angle_deg(history: DeflectionHistory, time_s: FloatArray) -> FloatArray:
 
 
 def _vectors(a: pd.DataFrame, b: pd.DataFrame) -> dict[str, FloatArray]:
-    """Sizes of the differences of position, velocity and attitude; NaN where one has no attitude."""
     first, other = trajectory_of(a), trajectory_of(b)
-    gap = difference(resample(other, first.time_s), first)
-    return {name: np.linalg.norm(gap[:, part], axis=1) * scale for name, part, scale in _APART}
+    return sizes_apart(resample(other, first.time_s), first)
+
+
+def sizes_apart(other: Trajectory, first: Trajectory) -> dict[str, FloatArray]:
+    """Sizes (n,) of the differences of position, velocity and attitude, by `APART`; NaN where one has no attitude."""
+    gap = difference(other, first).reshape(-1, 3, 3)
+    return {name: np.linalg.norm(gap[:, k], axis=1) * scale for k, (name, _, scale) in enumerate(APART)}

@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import Fault, FloatArray, GateError, Progress, check_type, part_of
+from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
-from recon.consistency import ConsistencyCheck, doubt
+from recon.consistency import doubt
 
 if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
     from estimators.agreement import Agreement
+    from estimators.fusing import CameraTimeBias, FusedAnswer
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
-    from postflight.fusing import CameraTimeBias, FusedAnswer
 
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
-NO_COMMON_ANSWER = ("inputs-far-off", "fusion-not-converged", "camera-time-bias", "deflection-undetermined")
+NO_COMMON_ANSWER = ("inputs-far-off", "not-converged", "camera-time-bias", "not-observable")
 # assumed plane, and the deflection that the paper read in it from the frame at 440 s (Table 2.1)
 PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 
@@ -38,7 +38,7 @@ class Deflections(Tabular):
     ----------
     histories : dict of DeflectionHistory
         By method: ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"``.
-    refused : dict of Fault
+    refused : dict of Issue
         Why a method gave none.
     fused : FusedAnswer or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
@@ -48,22 +48,22 @@ class Deflections(Tabular):
         What they were made from; None where the camera answered without a trajectory.
     increments : AeroIncrements or None
         Of the aerodynamic coefficients, where they were asked for (`with_increments`); ``no_increments`` says why not.
-    no_increments : Fault or None
+    no_increments : Issue or None
     """
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
-    refused: dict[str, Fault] = field(default_factory=dict)
+    refused: dict[str, Issue] = field(default_factory=dict)
     fused: FusedAnswer | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
     increments: AeroIncrements | None = field(default=None, compare=False)
-    no_increments: Fault | None = None
+    no_increments: Issue | None = None
 
     @property
     def history(self) -> DeflectionHistory:
         """The fused history; `GateError` with the reason where there is none."""
         if "fused" not in self.histories:
-            reason = self.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))
+            reason = self.refused.get("fused", Issue("the fused deflection was not asked for", "input-missing"))
             raise GateError([reason])
         return self.histories["fused"]
 
@@ -106,7 +106,7 @@ class Deflections(Tabular):
         return None if self.best is None else cycle_about(self.continuous[self.best], self.reference_s)
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether cameras agree, methods do, they have a common answer, and coefficients are as stated."""
         of_cameras = () if self.camera is None else self.camera.consistency_checks
         if self.fused is not None:
@@ -117,7 +117,7 @@ class Deflections(Tabular):
         if reason is None or reason.code not in NO_COMMON_ANSWER:
             return of_cameras
         name, words = "deflection methods have a common answer", str(reason)
-        return (*of_cameras, ConsistencyCheck("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
+        return (*of_cameras, Check("deflection-methods", name, 0.0, 1.0, 1.0, False, words))
 
     @property
     def doubt(self) -> str:
@@ -166,7 +166,7 @@ class Deflections(Tabular):
         return f"{self.doubt}; {answers}" if self.doubt else answers
 
 
-def borne_out(check: ConsistencyCheck, agreement: Agreement) -> ConsistencyCheck:
+def borne_out(check: Check, agreement: Agreement) -> Check:
     """Check of a camera: features that its film lacks are no fault where the inertial methods agree with its answer."""
     compared = [pair for pair in agreement.pairs if "camera" in pair.methods]
     if check.passed or check.code != "camera-features" or not compared or agreement.hypotheses:
@@ -175,13 +175,13 @@ def borne_out(check: ConsistencyCheck, agreement: Agreement) -> ConsistencyCheck
     return replace(check, high=check.value, passed=True, remark=words)
 
 
-def no_answer_at(history: DeflectionHistory, at_s: float) -> Fault:
+def no_answer_at(history: DeflectionHistory, at_s: float) -> Issue:
     """Why a history with answers has none at a time, which lies outside them or in a gap."""
     known = history.time_s[np.isfinite(history.theta_rad)]
     first, last = float(known[0]), float(known[-1])
     where = "a gap" if first < at_s < last else "the data begin" if at_s <= first else "the data end"
     words = f"no answer at {at_s:.2f} s: {where}; answers span {first:.2f} to {last:.2f} s"
-    return Fault(words, "no-answer")
+    return Issue(words, "no-answer")
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
@@ -278,14 +278,13 @@ def estimate(
     flown: Flight | Reconstruction,
     methods: tuple[str, ...],
     progress: Progress | None = None,
-    seen: Callable[[], CameraAnswer | None] = lambda: None,
-    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
+    camera: Result[CameraAnswer] | None = None,
+    time_bias: Result[CameraTimeBias | None] | None = None,
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone. What ``seen`` returns is taken for the camera's
-    answer, and waited for while other methods run; without it the film is read. ``tested``: the same of the test of the
-    camera's time bias.
+    A `Flight` without a trajectory has an answer of the camera alone. The result of ``camera`` is the camera's answer,
+    where it is worked out elsewhere meanwhile, and that of ``time_bias`` the test of the camera's time bias.
     """
     report = progress or (lambda _fraction, _what: None)
     flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
@@ -297,38 +296,37 @@ def estimate(
             if method == "camera":
                 from postflight.filming import camera_answer, keep_oriented
 
-                filmed = seen() or camera_answer(flight, bet, part_of(report, k / len(methods), (k + 1) / len(methods)))
+                shown = part_of(report, k / len(methods), (k + 1) / len(methods))
+                filmed = camera_answer(flight, bet, shown) if camera is None else camera.result()
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None:
-                raise GateError(f"{method}: needs a trajectory", "trajectory-missing")
+                raise GateError(f"{method}: needs a trajectory", "input-missing")
             elif method == "misalignment":
                 history = estimate_misalignment(bet)
             elif method == "trim":
                 history = estimate_trim(bet)
             else:
-                from postflight.fusing import fuse_flight
+                from estimators.fusing import fuse_flight
 
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
-                camera = filmed.plain if filmed is not None and used else None
-                if camera is None and "camera" not in answers.refused:
-                    camera = camera_for_fusion(flight)
-                fused = fuse_flight(
-                    bet.required_loads(), camera, _time_bias_sd_s(flight), tested if used else lambda: None
-                )
-                history = fused.fused.history
+                own = filmed.plain if filmed is not None and used else None
+                if own is None and "camera" not in answers.refused:
+                    own = camera_for_fusion(flight)
+                fused = fuse_flight(bet.required_loads(), own, _time_bias_sd_s(flight), time_bias if used else None)
+                history = fused.history
         except GateError as fault:
-            answers.refused[method] = Fault(str(fault), fault.codes[0])
+            answers.refused[method] = Issue(str(fault), fault.codes[0])
             continue
         answered = np.isfinite(history.theta_rad)
         if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
-            answers.refused[method] = Fault(words, "camera-no-frame")
+            answers.refused[method] = Issue(words, "too-few-data")
         elif answered.any():
             answers.histories[method] = history
         else:
-            answers.refused[method] = Fault(f"no sample has an answer ({history.assumptions})", "no-answer")
+            answers.refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
     histories = {m: answers.histories[m] for m in methods if m in answers.histories}
     refused = {m: answers.refused[m] for m in methods if m in answers.refused}
@@ -345,7 +343,7 @@ def with_increments(answers: Deflections) -> Deflections:
     try:
         return replace(answers, increments=_increments(answers.fused, answers.bet))
     except GateError as fault:
-        return replace(answers, no_increments=Fault(str(fault), fault.codes[0]))
+        return replace(answers, no_increments=Issue(str(fault), fault.codes[0]))
 
 
 @on_one_thread
@@ -367,9 +365,9 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     found = fuse(bet) if answers is None else answers
     check_type("aero_increments: answers", found, Deflections, "pf.fuse(bet)")
     if found.bet is not bet:
-        raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "answers-of-another")
+        raise GateError("aero_increments: these answers are of another trajectory: pf.fuse(bet)", "argument-value")
     if found.fused is None:
-        raise GateError([found.refused.get("fused", Fault("the fused deflection was not asked for", "fused-missing"))])
+        raise GateError([found.refused.get("fused", Issue("the fused deflection was not asked for", "input-missing"))])
     return _increments(found.fused, bet)
 
 
@@ -392,13 +390,15 @@ def _time_bias_sd_s(flight: Flight) -> float:
 
 def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> DeflectionHistory | None:
     """Fused deflection alone, without a test of the camera's time bias; None where there is none."""
-    from postflight.fusing import fuse_flight
+    from estimators.fusing import fuse_flight
 
+    untested: Future[CameraTimeBias | None] = Future()
+    untested.set_result(None)
     try:
-        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), lambda: (None,))
+        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested)
     except GateError:
         return None
-    found = answer.fused.history
+    found = answer.history
     return found if np.isfinite(found.theta_rad).any() else None
 
 

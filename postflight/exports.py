@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -44,31 +44,20 @@ from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import undulation_m
 from flightmodel.files import file_bytes, open_file, write_file, writing
+from postflight.intake.stored_tables import missing_library
 from postflight.run_folder import DIGITS, read_csv
 from postflight.runs import find_run
 from postflight.terminal import terminal
 
 _UNITS = {
     "m": "m", "mps": "m s-1", "mps2": "m s-2", "deg": "degree", "degps": "degree s-1", "pa": "Pa", "kgpm3": "kg m-3",
-    "k": "K", "s": "s",
+    "k": "K", "s": "s", "lat_deg": "degrees_north", "lon_deg": "degrees_east",
 }  # fmt: skip
 _STANDARD = {  # names of the CF conventions
-    "lat_deg": "latitude",
-    "lon_deg": "longitude",
-    "alt_m": "height_above_reference_ellipsoid",
-    "p_pa": "air_pressure",
-    "t_k": "air_temperature",
-    "rho_kgpm3": "air_density",
-    "wind_n_mps": "northward_wind",
-    "wind_e_mps": "eastward_wind",
-    "speed_ground_mps": "platform_speed_wrt_ground",
-}
-_COORDINATES = "time lat_deg lon_deg alt_m"
-_GAP_FACTOR = 5.0  # of the usual step of a deflection: a longer one is a gap
-_KML_STEP_S = 0.5  # between points of the track
-_MAT_HEADER = b"MATLAB 5.0 MAT-file, postflight export"  # scipy writes the time of writing there
-_CCSDS_FRAME = "ITRF2000"
-_SPICE_FRAME, _SPICE_ID = "ITRF93", -999000  # Earth-fixed; a number that no mission has, to be replaced
+    "lat_deg": "latitude", "lon_deg": "longitude", "alt_m": "height_above_reference_ellipsoid",
+    "p_pa": "air_pressure", "t_k": "air_temperature", "rho_kgpm3": "air_density",
+    "wind_n_mps": "northward_wind", "wind_e_mps": "eastward_wind", "speed_ground_mps": "platform_speed_wrt_ground",
+}  # fmt: skip
 _OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]
 
 
@@ -139,7 +128,7 @@ def read_source(folder: Path, wanted: str | None = None) -> Source:
             times, covariance = stored["t_s"], stored["covariance"]
     except FileNotFoundError as fault:
         words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
-        raise GateError(f"{run}: {words}", "trajectory-missing") from None
+        raise GateError(f"{run}: {words}", "input-missing") from None
     except (ValueError, KeyError, OSError) as fault:
         raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
     deflections = {p.stem.removeprefix("deflection_"): read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
@@ -151,19 +140,14 @@ def read_source(folder: Path, wanted: str | None = None) -> Source:
 
 def _unit(column: str) -> str:
     """UDUNITS name of a column's unit, by its suffix; ``1`` for none."""
-    tail = column.removesuffix("_sd").rsplit("_", 1)[-1]
-    if column == "lat_deg":
-        return "degrees_north"
-    if column == "lon_deg":
-        return "degrees_east"
-    return _UNITS.get(tail, "1")
+    return _UNITS.get(column) or _UNITS.get(column.removesuffix("_sd").rsplit("_", 1)[-1], "1")
 
 
 def _merged(source: Source) -> pd.DataFrame:
     """Trajectory, UTC and deflections, one row a time."""
     t = source.trajectory["t_s"].to_numpy()
     parts = {"t_s": t, "utc": [source.utc(x) + "Z" for x in t]}
-    parts |= {name: source.trajectory[name].to_numpy() for name in source.trajectory.columns if name != "t_s"}
+    parts |= {name: column.to_numpy() for name, column in source.trajectory.drop(columns="t_s").items()}
     for method, table in source.deflections.items():
         parts |= {f"{key}_{method}_{unit}": v for (key, unit), v in _at(table, t).items()}
     return pd.DataFrame(parts)
@@ -178,14 +162,10 @@ def _at(table: pd.DataFrame, t: FloatArray) -> dict[tuple[str, str], FloatArray]
     theta = table["theta_deg"].to_numpy()
     after = np.clip(np.searchsorted(at, t), 1, len(at) - 1)
     step = np.diff(at)
-    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > _GAP_FACTOR * np.median(step))
+    outside = (t < at[0]) | (t > at[-1]) | (step[after - 1] > 5.0 * np.median(step))  # a longer step is a gap
     y, z = (np.interp(t, at, theta * f(plane)) for f in (np.cos, np.sin))
-    values = (
-        np.hypot(y, z),
-        np.interp(t, at, table["theta_sd_deg"]),
-        np.mod(np.rad2deg(np.arctan2(z, y)), 360.0),
-        np.interp(t, at, table["plane_sd_deg"]),
-    )
+    theta_sd, plane_sd = (np.interp(t, at, table[name]) for name in ("theta_sd_deg", "plane_sd_deg"))
+    values = np.hypot(y, z), theta_sd, np.mod(np.rad2deg(np.arctan2(z, y)), 360.0), plane_sd
     return {key: np.where(outside, np.nan, value) for key, value in zip(keys, values, strict=True)}
 
 
@@ -222,18 +202,16 @@ def _mat(source: Source) -> bytes:
         "deflection": {method: _struct(table) for method, table in source.deflections.items()},
         "covariance": {"t_s": source.covariance_time_s[:, None], "position_velocity_rotation": source.covariance},
         "about": {
-            "title": source.title,
-            "run": source.run,
-            "epoch_utc": source.utc(0.0) + "Z",
-            "point": source.header["point"],
-            "synthetic": source.synthetic,
+            "title": source.title, "run": source.run, "epoch_utc": source.utc(0.0) + "Z",
+            "point": source.header["point"], "synthetic": source.synthetic,
         },
-    }
+    }  # fmt: skip
     if not source.deflections:
         del content["deflection"]
     out = io.BytesIO()
     savemat(out, content, long_field_names=True, oned_as="column", do_compression=True)
-    return _MAT_HEADER.ljust(116) + out.getvalue()[116:]
+    # scipy writes the time of writing there
+    return b"MATLAB 5.0 MAT-file, postflight export".ljust(116) + out.getvalue()[116:]
 
 
 def _struct(table: pd.DataFrame) -> dict[str, np.ndarray]:
@@ -257,7 +235,7 @@ def _netcdf(source: Source) -> bytes:
     identity = file.createVariable("trajectory_id", "c", ("name_length",))
     identity[:] = np.frombuffer(label, dtype="S1") if label else b" "
     identity.cf_role = "trajectory_id"
-    _table(file, source, source.trajectory, "time", "", _COORDINATES)
+    _table(file, source, source.trajectory, "time", "", "time lat_deg lon_deg alt_m")
     for method, table in source.deflections.items():
         if len(table):
             _table(file, source, table, f"time_{method}", f"_{method}", f"time_{method}")
@@ -274,9 +252,7 @@ def _table(file: object, source: Source, table: pd.DataFrame, time: str, ending:
     axis[:] = table["t_s"].to_numpy(dtype=float)
     axis.standard_name, axis.axis, axis.calendar = "time", "T", "standard"
     axis.units = f"seconds since {source.epoch:%Y-%m-%d %H:%M:%S.%f}"
-    for column in table.columns:
-        if column == "t_s":
-            continue
+    for column in table.columns.drop("t_s"):
         variable = create(column + ending, "d", (time,))
         variable[:] = table[column].to_numpy(dtype=float)
         variable.units = _unit(column)
@@ -292,40 +268,23 @@ def _kml(source: Source) -> bytes:
     """KML: track, line and events."""
     table = source.trajectory
     t = table["t_s"].to_numpy()
-    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / _KML_STEP_S + 1e-9), prepend=-1.0) > 0.0)
+    keep = np.flatnonzero(np.diff(np.floor((t - t[0]) / 0.5 + 1e-9), prepend=-1.0) > 0.0)  # a point every 0.5 s
     keep = np.unique(np.append(keep, len(t) - 1))
     latitude, longitude = np.deg2rad(table[["lat_deg", "lon_deg"]].to_numpy().T)
     above_sea_m = table["alt_m"].to_numpy() - undulation_m(latitude, longitude)
     place = np.column_stack([table[["lon_deg", "lat_deg"]].to_numpy(), above_sea_m])
     description = f"{source.title}; {source.header['point']}. Heights are above mean sea level (EGM96)."
-    whens = "".join(f"<when>{source.utc(t[k])}Z</when>\n" for k in keep)
-    track = "".join(f"<gx:coord>{' '.join(f'{v:.9g}' for v in place[k])}</gx:coord>\n" for k in keep)
-    line = "\n".join(",".join(f"{v:.9g}" for v in place[k]) for k in keep)
-    points = ""
-    for event in source.events.itertuples(index=False):
-        at = ",".join(f"{np.interp(event.t_s, t, c):.9g}" for c in place.T)
-        points += (
-            f"<Placemark><name>{_label(str(event.event))}</name><TimeStamp><when>{source.utc(event.t_s)}Z"
-            f"</when></TimeStamp><Point><altitudeMode>absolute</altitudeMode><coordinates>{at}</coordinates></Point>"
-            "</Placemark>\n"
-        )
-    text = f"""<?xml version="1.0" encoding="UTF-8"?>
-<kml xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2">
-<Document>
-<name>{_label(source.name)}</name>
-<description>{escape(escape(_printable(description))).replace("$[", "$ [")}</description>
-<Style id="flight"><LineStyle><color>ff0080ff</color><width>2</width></LineStyle></Style>
-<Placemark><name>track</name><styleUrl>#flight</styleUrl><gx:Track><altitudeMode>absolute</altitudeMode>
-{whens}{track}</gx:Track></Placemark>
-<Placemark><name>line</name><styleUrl>#flight</styleUrl><LineString><altitudeMode>absolute</altitudeMode><coordinates>
-{line}
-</coordinates></LineString></Placemark>
-<Folder><name>events</name>
-{points}</Folder>
-</Document>
-</kml>
-"""
-    return text.encode()
+    track = [(source.utc(t[k]), _place(place[k])) for k in keep]
+    events = [
+        (_label(str(e.event)), source.utc(e.t_s), _place([np.interp(e.t_s, t, c) for c in place.T]))
+        for e in source.events.itertuples(index=False)
+    ]
+    about = escape(escape(_printable(description))).replace("$[", "$ [")
+    return _filled("flight.kml", name=_label(source.name), description=about, track=track, events=events)
+
+
+def _place(coordinates: Iterable[float]) -> list[str]:
+    return [f"{v:.9g}" for v in coordinates]
 
 
 def _label(text: str) -> str:
@@ -335,43 +294,34 @@ def _label(text: str) -> str:
 
 def _oem(source: Source) -> bytes:
     """CCSDS OEM: km, km/s, km^2."""
-    table = source.trajectory
-    t = table["t_s"].to_numpy()
-    state = table[_OEM_STATE].to_numpy() / 1000.0
-    lines = [
-        *_ccsds_head(source, "OEM", "2.0"),
-        f"REF_FRAME = {_CCSDS_FRAME}",
-        "TIME_SYSTEM = UTC",
-        f"START_TIME = {source.utc(t[0])}",
-        f"STOP_TIME = {source.utc(t[-1])}",
-        "INTERPOLATION = HERMITE",
-        "INTERPOLATION_DEGREE = 3",
-        "META_STOP",
-        "",
+    t = source.trajectory["t_s"].to_numpy()
+    rows = _timed_rows(source, t, source.trajectory[_OEM_STATE].to_numpy() / 1000.0, 9)
+    triangles = [
+        "\n".join(" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6))
+        for covariance in source.covariance[:, :6, :6] / 1e6
     ]
-    lines += _timed_rows(source, t, state, 9)
-    lines += ["", "COVARIANCE_START"]
-    for at, covariance in zip(source.covariance_time_s, source.covariance[:, :6, :6] / 1e6, strict=True):
-        lines += [f"EPOCH = {source.utc(at)}", f"COV_REF_FRAME = {_CCSDS_FRAME}"]
-        lines += [" ".join(f"{v:.9e}" for v in covariance[k, : k + 1]) for k in range(6)]
-    return ("\n".join([*lines, "COVARIANCE_STOP"]) + "\n").encode()
+    covariances = zip(source.covariance_time_s, triangles, strict=True)
+    return _message("flight.oem", source, t=t, rows="\n".join(rows), covariances=covariances)
 
 
-def _ccsds_head(source: Source, message: str, version: str) -> list[str]:
-    """Header and first metadata of a CCSDS message."""
+def _message(template: str, source: Source, **values: Any) -> bytes:
+    """CCSDS message of a template."""
     name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
-    return [
-        f"CCSDS_{message}_VERS = {version}",
-        "COMMENT " + _printable(source.title, "?", ascii_only=True),
-        f"COMMENT point: {_printable(source.header['point'], '?', ascii_only=True)}",
-        f"CREATION_DATE = {source.finished_utc[:19]}",
-        "ORIGINATOR = POSTFLIGHT",
-        "",
-        "META_START",
-        f"OBJECT_NAME = {name}",
-        f"OBJECT_ID = {source.epoch:%Y}-000A",
-        "CENTER_NAME = EARTH",
-    ]
+    return _filled(template, source=source, name=name, **values)
+
+
+def _filled(template: str, **values: Any) -> bytes:
+    """Text of a template, filled in."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("postflight", "export_templates"),
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+        trim_blocks=True,
+    )
+    environment.filters["ascii"] = lambda text: _printable(text, "?", ascii_only=True)
+    return environment.get_template(template).render(values).encode()
 
 
 def _attitude(source: Source) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -390,24 +340,8 @@ def _attitude(source: Source) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _aem(source: Source) -> bytes:
     """CCSDS AEM."""
     t, q, _ = _attitude(source)
-    lines = [
-        *_ccsds_head(source, "AEM", "1.0"),
-        f"REF_FRAME_A = {_CCSDS_FRAME}",
-        "REF_FRAME_B = SC_BODY_1",
-        "ATTITUDE_DIR = A2B",
-        "TIME_SYSTEM = UTC",
-        f"START_TIME = {source.utc(t[0])}",
-        f"STOP_TIME = {source.utc(t[-1])}",
-        "ATTITUDE_TYPE = QUATERNION",
-        "QUATERNION_TYPE = LAST",
-        "INTERPOLATION_METHOD = LINEAR",
-        "INTERPOLATION_DEGREE = 1",
-        "META_STOP",
-        "",
-        "DATA_START",
-    ]
-    lines += _timed_rows(source, t, q[:, [1, 2, 3, 0]])
-    return ("\n".join([*lines, "DATA_STOP"]) + "\n").encode()
+    rows = _timed_rows(source, t, q[:, [1, 2, 3, 0]])
+    return _message("flight.aem", source, t=t, rows="\n".join(rows))
 
 
 def _msopck(source: Source) -> bytes:
@@ -423,27 +357,14 @@ def _timed_rows(source: Source, t: FloatArray, rows: FloatArray, decimals: int =
 
 def _msopck_setup(source: Source, data: Path) -> bytes:
     """Setup of msopck for the input in a file, as a text kernel; lines are below its 132 characters."""
-    title = _printable(source.title, "?", ascii_only=True)
-    body = data.name
     longest = float(np.diff(_attitude(source)[0]).max(initial=0.0))
-    keys = {
-        "LSK_FILE_NAME": "'naif0012.tls'",
-        "MAKE_FAKE_SCLK": f"'{data.stem}.tsc'",
-        "CK_TYPE": "3",
-        "INSTRUMENT_ID": str(_SPICE_ID),
-        "REFERENCE_FRAME_NAME": f"'{_SPICE_FRAME}'",
-        "INPUT_TIME_TYPE": "'UTC'",
-        "INPUT_DATA_TYPE": "'SPICE QUATERNIONS'",
-        "ANGULAR_RATE_PRESENT": "'YES'",
-        "ANGULAR_RATE_FRAME": "'INSTRUMENT'",
-        "MAXIMUM_VALID_INTERVAL": f"{max(1.0, 1.01 * longest):.6g}",
-        "CHECK_TIME_ORDER": "'YES'",
-        "PRODUCER_ID": "'POSTFLIGHT'",
-    }
-    lines = ["KPL/IK", "", title[:120], "", f"    msopck {body}.setup {body} {data.stem}.bc"[:130], ""]
-    lines += [f"Replace {_SPICE_ID} by your structure's NAIF id; NAIF supplies the leap seconds (naif0012.tls).", ""]
-    lines += ["\\begindata", "", *(f"   {key} = {value}" for key, value in keys.items()), "", "\\begintext", ""]
-    return "\n".join(lines).encode()
+    return _filled(
+        "msopck.setup",
+        title=_printable(source.title, "?", ascii_only=True),
+        command=f"    msopck {data.name}.setup {data.name} {data.stem}.bc",
+        stem=data.stem,
+        interval=f"{max(1.0, 1.01 * longest):.6g}",
+    )
 
 
 def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> str:
@@ -451,19 +372,12 @@ def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> st
     return "".join(c if c.isprintable() and (c.isascii() or not ascii_only) else instead for c in text)
 
 
-# format: what writes it, the suffix of its file
-FORMS: dict[str, tuple[Callable[[Source], bytes], str]] = {
-    "csv": (_csv, ".csv"),
-    "parquet": (_parquet, ".parquet"),
-    "mat": (_mat, ".mat"),
-    "nc": (_netcdf, ".nc"),
-    "kml": (_kml, ".kml"),
-    "oem": (_oem, ".oem"),
-    "aem": (_aem, ".aem"),
-    "msopck": (_msopck, ".msopck"),
-}
+# format, which is its file's suffix too: what writes it
+FORMS: dict[str, Callable[[Source], bytes]] = {
+    "csv": _csv, "parquet": _parquet, "mat": _mat, "nc": _netcdf, "kml": _kml, "oem": _oem, "aem": _aem,
+    "msopck": _msopck,
+}  # fmt: skip
 _OF_THE_EARTH = ("oem", "aem", "kml", "msopck")  # by their frames
-EXTRAS = {"pyarrow": "parquet"}  # library, and the extra of the installation that brings it
 console = terminal()
 
 
@@ -478,24 +392,18 @@ def export(folder: Path, form: str, out: Path | None, run: str | None = None) ->
         Where the flight has no run with a trajectory.
     """
     source = read_source(folder, run)
-    write, suffix = FORMS[form]
     if form in _OF_THE_EARTH:
         earth.require_earth(source.header.get("planet", "earth"), f"--to {form}")
-    path = out or folder / "exports" / f"{source.run}{suffix}"
+    path = out or folder / "exports" / f"{source.run}.{form}"
     if (folder / "runs").resolve() in path.resolve().parents:
-        raise ConfigError(f"{path}: run folders stay as they were written; name another place", "export-into-run")
+        raise ConfigError(f"{path}: run folders stay as they were written; name another place", "file-exists")
     try:
-        content = write(source)
+        content = FORMS[form](source)
     except ImportError as fault:
-        name = (fault.name or "").partition(".")[0]
-        if name not in EXTRAS:
-            raise
-        words = f"--to {form} needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
-        raise ConfigError(words, "library-missing") from None
+        raise ConfigError(f"--to {form} {missing_library(fault)}", "package-missing") from None
     with writing(path, "name another place with --out"):
         write_file(path, content)
-    if form == "msopck":
-        with writing(path, "name another place with --out"):
+        if form == "msopck":
             write_file(path.with_name(f"{path.name}.setup"), _msopck_setup(source, path))
     console.print(
         f"{markup.escape(str(path))} ({len(content) / 1e6:.1f} MB) of run {markup.escape(source.run + source.what_if)}",

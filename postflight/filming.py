@@ -13,25 +13,24 @@ import numpy as np
 import pandas as pd
 
 from estimators.agreement import CONFIDENCE
-from estimators.assumed_plane import LIMIT_SD, PlaneTest, plane_test
+from estimators.assumed_plane import plane_check
 from estimators.benchmark import BenchmarkDeflection, benchmark_deflection, joint_moment, orient_camera
 from estimators.camera import FilmFit, JointSwing, read_film
 from estimators.camera_fit import OrientedCamera
 from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
 from estimators.frame_edits import edited
+from estimators.fusing import CAMERA_PLANE_SD_RAD, CameraTimeBias, time_bias_if_free
 from estimators.fusion import smoothed
 from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
-from estimators.unloaded_frames import Rest, rest_of
-from flightmodel.checks import DivergenceError, Fault, GateError, Progress, part_of
+from estimators.unloaded_frames import rest_check
+from flightmodel.checks import Check, DivergenceError, GateError, Issue, Progress, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
 from postflight.flight import NO_VIDEO, Flight
-from postflight.fusing import CAMERA_PLANE_SD_RAD
 from postflight.reconstruction import Reconstruction
-from recon.consistency import ConsistencyCheck
 
 _SAME_FRAME_S = 1e-3
 # cameras that were oriented last, of which a run's pictures ask several times; as many as flights have
@@ -55,19 +54,15 @@ class CameraAnswer:
         What became of every frame: ``camera`` and the columns of `FilmFit.frame_table`.
     joined : JoinedCameras or None
         None of one camera alone.
-    refused : dict of Fault
+    refused : dict of Issue
         Cameras whose film cannot be used, and why.
     benchmarks_s : tuple of float
         Times of the benchmark frames.
     shape : ShellShape or None
         How the shell's shape followed the load; None where nothing determines it (why stands in the assumptions).
-    rests : dict of Rest
-        Of each camera whose film can tell: whether its benchmark frame is one at rest.
-    plane : PlaneTest or None
-        Whether the film bears out the plane that is assumed.
-    unfounded : dict of Fault
-        Of each camera, where the vehicle file states features: why its benchmark frame does not show them; empty where
-        it does.
+    consistency_checks : tuple of Check
+        Whether each camera's shell rests without load, shows stated features and lies in the assumed plane; whether
+        several cameras agree.
     oriented : dict of OrientedCamera
         Each camera with an answer, oriented on its benchmark frame.
     """
@@ -77,12 +72,10 @@ class CameraAnswer:
     smooth: DeflectionHistory | None
     frames: pd.DataFrame
     joined: JoinedCameras | None
-    refused: dict[str, Fault]
+    refused: dict[str, Issue]
     benchmarks_s: tuple[float, ...]
     shape: ShellShape | None = None
-    rests: dict[str, Rest] = field(default_factory=dict)
-    plane: PlaneTest | None = None
-    unfounded: dict[str, Fault] = field(default_factory=dict)
+    consistency_checks: tuple[Check, ...] = ()
     oriented: dict[str, OrientedCamera] = field(default_factory=dict)
 
     @property
@@ -90,43 +83,6 @@ class CameraAnswer:
         """Whether no frame but a benchmark frame has an answer."""
         answered = self.history.time_s[np.isfinite(self.history.theta_rad)]
         return len(answered) > 0 and bool(np.isin(answered, self.benchmarks_s).all())
-
-    @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
-        """Whether each camera's shell rests without load, and in the assumed plane; whether several cameras agree."""
-        checks = [
-            ConsistencyCheck(
-                "camera-rest", f"{name}: deflection without load over its sd", rest.over_sd, 0.0, rest.limit,
-                rest.passed, f"{name}: {rest.remark}", "camera" if self.joined is None else name,
-            )
-            for name, rest in self.rests.items()
-        ]  # fmt: skip
-        for camera, why in self.unfounded.items():
-            words = f"{camera}: the benchmark frame shows the features that the vehicle file states"
-            if why:
-                words = (
-                    f"{camera}: {why}; the answers go by edge and texture, and more may be wrong: check outline, mount "
-                    'and lens of the vehicle file and that the frame is one at rest, or state features = "texture"'
-                )
-            source, name = "camera" if self.joined is None else camera, f"{camera}: stated features not found"
-            checks.append(ConsistencyCheck("camera-features", name, float(bool(why)), 0.0, 0.0, not why, words, source))
-        if self.plane is not None:
-            name, of = "deflection that the assumed plane leaves out, over its sd", self.plane
-            checks.append(
-                ConsistencyCheck("camera-plane", name, of.over_sd, 0.0, LIMIT_SD, of.passed, of.remark, "camera")
-            )
-        if self.joined is None:
-            return tuple(checks)
-        if self.joined.tests:
-            least = min(test.p_value for test in self.joined.tests)
-            name, low = "cameras agree: least chance of a test", 1.0 - CONFIDENCE
-            one = self.joined
-            checks.append(ConsistencyCheck("cameras", name, least, low, 1.0, one.agree, one.remark, one.suspect))
-        words = "; ".join(f"{name}: {reason}" for name, reason in self.refused.items()) or "every camera has an answer"
-        count = float(len(self.refused))
-        source = ", ".join(self.refused)
-        name = "cameras without an answer"
-        return (*checks, ConsistencyCheck("camera-refused", name, count, 0.0, 0.0, not self.refused, words, source))
 
 
 def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress | None = None) -> FilmFit:
@@ -216,24 +172,38 @@ def camera_answer(
         film = shaped[name]
         found, uncorrected = _benchmark(film, flight.telemetry.films[name].time_bias_sd_s, flight, bet)
         history = film.history(found)
-        rests = _rests(name, film, history, bet, found is not None)
+        checks = [
+            *_rests("camera", name, film, history, bet, found is not None),
+            *_features("camera", name, film, flight),
+        ]
+        plane = plane_check(film)
         history = replace(history, assumptions=f"{history.assumptions}{uncorrected}; {why}")
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         smooth = _smooth(flight, history)
         return CameraAnswer(
-            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape, rests, plane_test(film),
-            _unfounded(shaped, flight), {name: film.oriented},
+            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape,
+            (*checks, *(() if plane is None else (plane,))), {name: film.oriented},
         )  # fmt: skip
     if flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
-        raise GateError(words, "plane-assumed")
+        raise GateError(words, "keys-conflict")
     return _of_several(flight, bet, progress)
+
+
+def answer_of_film(bet: Reconstruction, film: FilmFit) -> CameraAnswer:
+    """`camera_answer` of a flight whose film is read."""
+    return camera_answer(bet.flight, bet, film=film)
+
+
+def time_bias_of(bet: Reconstruction, camera: CameraAnswer) -> CameraTimeBias | None:
+    """`time_bias_if_free` of a trajectory and a camera's answer."""
+    return time_bias_if_free(bet.required_loads(), camera.plain)
 
 
 def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
     films: dict[str, FilmFit] = {}
-    refused: dict[str, Fault] = {}
+    refused: dict[str, Issue] = {}
     of_flight = flight.telemetry.films
     count = len(of_flight)
     # one after the other: in threads they take as long, for each holds the interpreter most of the time
@@ -242,19 +212,19 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
         try:
             films[name] = camera_film(flight, frames, shown)
         except GateError as fault:
-            refused[name] = Fault(str(fault), fault.codes[0])
+            refused[name] = Issue(str(fault), fault.codes[0])
     if not films:
-        raise GateError([Fault(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
+        raise GateError([Issue(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
     films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
     plain, corrected, tables, remarks = [], [], [], []
-    rests: dict[str, Rest] = {}
+    rests: list[Check] = []
     for name, film in films.items():
         late_s = flight.telemetry.films[name].time_bias_sd_s
         read, nothing = film.relative_to_benchmark(late_s), film.oriented.apriori.benchmark_rad**2 * np.eye(2)
         one = CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD))
         found, why = _benchmark(film, late_s, flight, bet)
         history = film.history(found)
-        rests |= _rests(name, film, history, bet, found is not None)
+        rests += _rests(name, name, film, history, bet, found is not None)
         table = film.frame_table(history)
         table.insert(0, "camera", name)
         tables.append(table)
@@ -267,15 +237,28 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
     known = any(one is not two for one, two in zip(corrected, plain, strict=True))
     at_plain = join_cameras(plain, hz) if known else joined
     unused = {one.name for one in plain} - {one.name for one in joined.readings}
-    refused |= {name: Fault("too few frames with an answer", "too-few-readings") for name in unused}
+    refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in unused}
     remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
     words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
     history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
     times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
+    checks = [*rests, *(check for name, film in films.items() for check in _features(name, name, film, flight))]
     return CameraAnswer(
-        history, at_plain.at_frames, smooth, frames, joined, refused, times, shape, rests,
-        unfounded=_unfounded(films, flight), oriented={name: film.oriented for name, film in films.items()},
+        history, at_plain.at_frames, smooth, frames, joined, refused, times, shape,
+        (*checks, *_of_all(joined, refused)), {name: film.oriented for name, film in films.items()},
     )  # fmt: skip
+
+
+def _of_all(joined: JoinedCameras, refused: dict[str, Issue]) -> list[Check]:
+    """Whether the cameras agree, and each has an answer."""
+    checks = []
+    if joined.tests:
+        least, name = min(test.p_value for test in joined.tests), "cameras agree: least chance of a test"
+        passed, words = joined.agree, joined.remark
+        checks.append(Check("cameras", name, least, 1.0 - CONFIDENCE, 1.0, passed, words, joined.suspect))
+    words = "; ".join(f"{name}: {reason}" for name, reason in refused.items()) or "every camera has an answer"
+    count, name, source = float(len(refused)), "cameras without an answer", ", ".join(refused)
+    return [*checks, Check("camera-refused", name, count, 0.0, 0.0, not refused, words, source)]
 
 
 def _with_shell_shape(
@@ -284,9 +267,9 @@ def _with_shell_shape(
     """Films with the shell's shape under load in their answers, that shape, and a remark on it or why there is none."""
     try:
         if bet is None:
-            raise GateError("no trajectory was made", "trajectory-missing")
+            raise GateError("no trajectory was made", "input-missing")
         if flight.camera_plane_lv_rad is not None:
-            raise GateError("a plane is assumed", "plane-assumed")
+            raise GateError("a plane is assumed", "keys-conflict")
         loaded = {name: _with_pressure(film, bet) for name, film in films.items()}
         shape = shell_shape(list(loaded.values()))
     except GateError as fault:
@@ -309,24 +292,37 @@ def _benchmark(
     try:
         if bet is None:
             flight.telemetry.required_triads()
-            raise GateError("no trajectory was made", "trajectory-missing")
+            raise GateError("no trajectory was made", "input-missing")
         frames = film.relative_to_benchmark(late_s)
         return benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad), ""
     except GateError as fault:
         return None, f"; the benchmark's deflection is not corrected by the joint's moment ({fault})"
 
 
-def _unfounded(films: dict[str, FilmFit], flight: Flight) -> dict[str, Fault]:
-    """Of each film, where the vehicle file states features: why they are not used, empty where they are."""
+def _features(source: str, name: str, film: FilmFit, flight: Flight) -> list[Check]:
+    """Whether a film's benchmark frame shows the features that the vehicle file states, if any."""
     if flight.telemetry.required_vehicle().geometry.features in ("none", "texture"):
-        return {}
-    return {name: film.oriented.stated_refused for name, film in films.items()}
+        return []
+    why, words = (
+        film.oriented.stated_refused,
+        f"{name}: the benchmark frame shows the features that the vehicle file states",
+    )
+    if why:
+        words = (
+            f"{name}: {why}; the answers go by edge and texture, and more may be wrong: check outline, mount "
+            'and lens of the vehicle file and that the frame is one at rest, or state features = "texture"'
+        )
+    return [
+        Check(
+            "camera-features", f"{name}: stated features not found", float(bool(why)), 0.0, 0.0, not why, words, source
+        )
+    ]
 
 
 def _rests(
-    name: str, film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool
-) -> dict[str, Rest]:
-    """Whether a camera's shell rests in frames without load, by name; nothing where no frame can say.
+    source: str, name: str, film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool
+) -> list[Check]:
+    """Whether a camera's shell rests in frames without load; nothing where no frame can say.
 
     The load is the moment in the joint, or without inertial sensors the dynamic pressure; unknown without a trajectory.
     """
@@ -337,8 +333,10 @@ def _rests(
     else:
         moment_nm = np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)
         load = np.interp(film.time_s, bet.loads.time_s, moment_nm, left=np.nan, right=np.nan)
-    rest = rest_of(history, load, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
-    return {} if rest is None else {name: rest}
+    rest = rest_check(history, load, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
+    if rest is None:
+        return []
+    return [replace(rest, name=f"{name}: {rest.name}", remark=f"{name}: {rest.remark}", source=source)]
 
 
 def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | None:

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import ConfigError, Fault, GateError, Progress, check_path, nearest_name
+from flightmodel.checks import ConfigError, GateError, Issue, Progress, check_path, nearest_name
 from flightmodel.files import file_bytes
 from flightmodel.flightfolder import read_flight as read_telemetry
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import Finding, Sounding, Telemetry
+from flightmodel.telemetry import Sounding, Telemetry
 from flightmodel.vehicle import MassProperties, Vehicle
 from recon.settings import Settings
 
@@ -75,7 +75,7 @@ class Flight(Tabular):
         return self.telemetry.vehicle
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Issue, ...]:
         """What the gate found in the data: gaps, frozen and missing samples, repairs of row order."""
         return self.telemetry.findings
 
@@ -229,7 +229,7 @@ def _changed(flight: Flight, name: str, value: Any) -> Flight:
     if name not in ASSUMPTIONS:
         known = (*ASSUMPTIONS, "camera_plane_lv_deg", *sorted(SETTINGS))
         hint = nearest_name(name, known)
-        raise GateError(f"assumption '{name}'{hint}: no such assumption; known: {', '.join(known)}", "what-if-unknown")
+        raise GateError(f"assumption '{name}'{hint}: no such assumption; known: {', '.join(known)}", "name-unknown")
     return replace(flight, telemetry=ASSUMPTIONS[name](flight.telemetry, name, value))
 
 
@@ -241,12 +241,12 @@ def _with_setting(settings: Settings, name: str, value: Any) -> Settings:
     try:
         return replace(settings, **{name: value})
     except TypeError as fault:
-        raise GateError(f"setting {name} = {value!r}: {fault}", "setting-value") from None
+        raise GateError(f"setting {name} = {value!r}: {fault}", "value-range") from None
 
 
 def _number(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not low < float(value) < high:
-        raise GateError(f"assumption {name} = {value!r}: a number between {low:g} and {high:g} wanted", "what-if-value")
+        raise GateError(f"assumption {name} = {value!r}: a number between {low:g} and {high:g} wanted", "value-range")
     return float(value)
 
 
@@ -279,12 +279,12 @@ def _cg_shift(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     except (TypeError, ValueError):
         shift = np.zeros(0)
     if shift.shape != (3,) or not np.isfinite(shift).all():
-        raise GateError(f"{wanted}: three numbers in body axes, m, are wanted", "what-if-value")
+        raise GateError(f"{wanted}: three numbers in body axes, m, are wanted", "value-range")
     x, y, z = vehicle.cg_m + shift
     length, radius = _reach_m(vehicle), vehicle.geometry.base_radius_m
     if not (-length <= x <= 0.0 and np.hypot(y, z) <= radius):
         words = f"the c.g. would lie {-x:.3g} m aft of the nose and {np.hypot(y, z):.3g} m off the axis, outside the "
-        raise GateError(f"{wanted}: {words}vehicle: {length:.3g} m and {radius:.3g} m at most", "what-if-outside")
+        raise GateError(f"{wanted}: {words}vehicle: {length:.3g} m and {radius:.3g} m at most", "value-range")
     carried = vehicle.mass_kg / vehicle.centerbody.mass_kg * shift
 
     def moved(name: str, part: MassProperties) -> MassProperties:
@@ -299,7 +299,7 @@ def _joint_station(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     station, length = _number(name, value), _reach_m(vehicle)
     if not 0.0 <= station <= length:
         words = f"outside the vehicle, which reaches from the nose to {length:.3g} m aft of it"
-        raise GateError(f"assumption {name} = {value!r}: {words}", "what-if-outside")
+        raise GateError(f"assumption {name} = {value!r}: {words}", "value-range")
     joint = vehicle.joint.model_copy(update={"station_m": station})
     return replace(telemetry, vehicle=replace(vehicle, joint=joint))
 
@@ -315,7 +315,7 @@ def _density(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
 
 def _attitude_prior(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     if value is not None:
-        raise GateError([Fault(f"assumption {name}: only None (no prior) can be assumed", "what-if-value")])
+        raise GateError([Issue(f"assumption {name}: only None (no prior) can be assumed", "value-range")])
     return replace(telemetry, attitude_prior=None)
 
 

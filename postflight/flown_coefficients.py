@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from estimators.fusing import FusedAnswer
 from estimators.fusion import Fused
 from estimators.increments import COEFFICIENTS, STATED, Increments, estimate_increments
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import COLUMNS, AeroTable
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import Check, FloatArray, GateError
 from flightmodel.files import write_file
 from flightmodel.tabular import Tabular
-from postflight.fusing import FusedAnswer
-from recon.consistency import MOST_KEPT_SD, ConsistencyCheck, data_sheet_check
+from recon.consistency import MOST_KEPT_SD, data_sheet_check
 
 TABLE = "aero_as_flown"
 _ANGLE_DIGITS = 13  # angles must be evenly spaced to 1e-9
@@ -132,7 +132,7 @@ class AeroIncrements(Tabular):
         return table
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether each coefficient's increments are within what the vehicle file states; none where not observable."""
         found = []
         for k, name in enumerate(COEFFICIENTS):
@@ -217,9 +217,9 @@ def increments_of(answer: FusedAnswer, confidence: float, name: str) -> AeroIncr
         Where they do not settle.
     """
     if answer.reader is None:
-        raise GateError("aerodynamic increments: the fused answer has no readings", "fused-missing")
-    found = estimate_increments(answer.reader, answer.fused)
-    return AeroIncrements(found, answer.reader.pulse, answer.fused, confidence, name)
+        raise GateError("aerodynamic increments: the fused answer has no readings", "input-missing")
+    found = estimate_increments(answer.reader, answer)
+    return AeroIncrements(found, answer.reader.pulse, answer, confidence, name)
 
 
 def write_aero_table(path: Path, table: AeroTable) -> None:

@@ -11,9 +11,9 @@ import pandas as pd
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError, Progress, check_path, check_type, check_whole
 from flightmodel.tabular import Tabular
-from flightmodel.trajectory import difference, resample
+from flightmodel.trajectory import resample
 from postflight.checks.folder_check import Report, check_folder
-from postflight.comparison import sd_bounds
+from postflight.comparison import APART, sd_bounds, sizes_apart
 from postflight.deflections import Deflections
 from postflight.flight import RECONSTRUCT
 from postflight.montecarlo import execution
@@ -218,18 +218,11 @@ def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflec
 
 
 Row = tuple[str, str, float, float, float, float]
-DEG = 180.0 / np.pi
-# quantity at peak dynamic pressure, its unit and its column of bet.csv
-_AT_PEAK = (
-    ("peak dynamic pressure", "Pa", "dynamic_pressure_pa"),
-    ("Mach number at peak q", "", "mach"),
-    ("total angle of attack at peak q", "deg", "alpha_total_wind_deg"),
-)
 
 
 def _bet_of(answer: Deflections) -> Reconstruction:
     if answer.bet is None:
-        raise GateError("compare: these deflections were made without a trajectory", "trajectory-missing")
+        raise GateError("compare: these deflections were made without a trajectory", "input-missing")
     return answer.bet
 
 
@@ -241,7 +234,11 @@ def _peak_rows(first: Reconstruction, second: Reconstruction) -> list[Row]:
     """Values at each one's own peak, as events.csv and peaks.csv have them."""
     bets = (first, second)
     rows: list[Row] = [("time of peak dynamic pressure", "s", first.peak_s, np.nan, second.peak_s, np.nan)]
-    for name, unit, column in _AT_PEAK:
+    for name, unit, column in (
+        ("peak dynamic pressure", "Pa", "dynamic_pressure_pa"),
+        ("Mach number at peak q", "", "mach"),
+        ("total angle of attack at peak q", "deg", "alpha_total_wind_deg"),
+    ):
         one, other = (value_and_sd(bet.table, column, bet.peak_s) for bet in bets)
         rows.append((name, unit, *one, *other))
     return rows
@@ -254,14 +251,14 @@ def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]
     other = second.trajectory.time_s
     use &= (t >= other[0]) & (t <= other[-1])
     if not use.any():
-        raise GateError("compare: the two trajectories have no time of the pressure pulse in common", "no-common-time")
-    apart = difference(resample(second.trajectory, t[use]), resample(first.trajectory, t[use]))
+        raise GateError(
+            "compare: the two trajectories have no time of the pressure pulse in common", "time-not-covered"
+        )
+    apart = sizes_apart(resample(second.trajectory, t[use]), resample(first.trajectory, t[use]))
     rows: list[Row] = []
-    for k, (name, unit, scale) in enumerate(
-        (("position", "m", 1.0), ("velocity", "m/s", 1.0), ("attitude", "deg", DEG))
-    ):
-        largest = scale * float(np.linalg.norm(apart[:, 3 * k : 3 * k + 3], axis=1).max())
-        rows.append((f"largest difference of {name} over the pulse", unit, 0.0, np.nan, largest, np.nan))
+    for column, unit, _ in APART:
+        name = f"largest difference of {column.split('_')[0]} over the pulse"
+        rows.append((name, unit, 0.0, np.nan, float(apart[column].max()), np.nan))
     return rows
 
 

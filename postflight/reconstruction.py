@@ -30,12 +30,12 @@ from estimators.loads import FlightLoads, pitching_radps
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
-from flightmodel.checks import BoolArray, DivergenceError, Fault, FloatArray, GateError, Progress, check_type
+from flightmodel.checks import BoolArray, Check, DivergenceError, FloatArray, GateError, Issue, Progress, check_type
 from flightmodel.events import find_peak
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.tables import column_about
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import LARGEST_GAP_S, Finding, Telemetry
+from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from postflight.checks.track_clocks import clock_faults
@@ -50,7 +50,7 @@ from recon.atmosphere import (
     too_sparse,
     windows_are_whole,
 )
-from recon.consistency import ConsistencyCheck, doubt
+from recon.consistency import doubt
 from recon.entry_density import (
     density_by_drag,
     density_check,
@@ -58,7 +58,7 @@ from recon.entry_density import (
     profile_as_flown,
     temperature_check,
 )
-from recon.fault_isolation import FaultHypothesis, isolate_faults
+from recon.fault_isolation import isolate_faults
 from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
@@ -149,15 +149,15 @@ class Reconstruction(Tabular):
         Motion and flow at the c.g., for the estimators of the deflection; None where ``missing`` says why.
     as_flown : ReconstructedAir or None
         As-flown density, winds and C_A, from the deceleration.
-    missing : tuple of Fault
+    missing : tuple of Issue
         Why there are no loads or no as-flown atmosphere.
     attitude : AttitudeCheck or None
         Comparison with an attitude from magnetometer and Sun sensors alone.
     density : DataFrame or None
         Air by the deceleration with the drag of [drag], `recon.entry_density`.
-    density_checks : tuple of ConsistencyCheck
+    density_checks : tuple of Check
         Of that density against the stated atmosphere's.
-    clocks : tuple of FaultHypothesis
+    clocks : tuple of Issue
         Time tags that are off by tracks against inertial sensors; looked for where a check fails.
     """
 
@@ -167,11 +167,11 @@ class Reconstruction(Tabular):
     profile: AtmosphereProfile
     loads: FlightLoads | None
     as_flown: ReconstructedAir | None = None
-    missing: tuple[Fault, ...] = ()
+    missing: tuple[Issue, ...] = ()
     attitude: AttitudeCheck | None = None
     density: pd.DataFrame | None = None
-    density_checks: tuple[ConsistencyCheck, ...] = ()
-    clocks: tuple[FaultHypothesis, ...] = ()
+    density_checks: tuple[Check, ...] = ()
+    clocks: tuple[Issue, ...] = ()
 
     @property
     def telemetry(self) -> Telemetry:
@@ -184,19 +184,19 @@ class Reconstruction(Tabular):
         return self.solution.smoothed
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Checks of the trajectory, then of its attitude, then of the atmosphere."""
         attitude, air = (part.consistency_checks if part is not None else () for part in (self.attitude, self.as_flown))
         return self.solution.consistency_checks + attitude + air + self.density_checks
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[Issue, ...]:
         """What was found in the data, on the way, and by the check of the attitude."""
         attitude = () if self.attitude is None else self.attitude.findings
         return (*self.telemetry.findings, *self.solution.findings, *attitude)
 
     @property
-    def suspects(self) -> tuple[Fault, ...]:
+    def suspects(self) -> tuple[Issue, ...]:
         """Fault hypotheses, the most likely first; none where every consistency check passes."""
         checks, solution = self.consistency_checks, self.solution
         return (*self.clocks, *isolate_faults(checks, solution.left_out, solution.single_faults))
@@ -232,7 +232,7 @@ class Reconstruction(Tabular):
     def required_loads(self) -> FlightLoads:
         """Motion and flow at the c.g.; `GateError` with the reason where there are none."""
         if self.loads is None:
-            raise GateError("; ".join(self.missing), "loads-missing")
+            raise GateError("; ".join(self.missing), "input-missing")
         return self.loads
 
     @property
@@ -335,7 +335,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
     telemetry = flight.telemetry
     _check_inside_tables(solution.smoothed)
     stated = profile = profile_from_sounding(telemetry.sounding)
-    density, checks = None, tuple[ConsistencyCheck, ...]()
+    density, checks = None, tuple[Check, ...]()
     if telemetry.drag is not None:
         density = density_by_drag(telemetry, solution.smoothed, solution.drag)
         tests, confidence = (density_check, temperature_check, drag_jump_check), solution.settings.check_confidence
@@ -344,7 +344,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
         profile = profile_as_flown(stated, density)
     air = airdata.air_data(solution.smoothed, profile, _arm(flight.vehicle))
     loads, as_flown = None, None
-    missing: list[Fault] = []
+    missing: list[Issue] = []
     try:
         telemetry.required_vehicle()
         telemetry.required_triads()
@@ -621,14 +621,14 @@ class AttitudeCheck:
     comparison : AttitudeComparison or None
     dependence : str
         ``"filter"`` or ``"start"`` where the trajectory itself depends on these sensors, empty where it does not.
-    findings : tuple of Finding
+    findings : tuple of Issue
     confidence : float
     """
 
     history: AttitudeHistory | None
     comparison: AttitudeComparison | None
     dependence: str
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     confidence: float
 
     @property
@@ -638,27 +638,16 @@ class AttitudeCheck:
         return "; ".join(part for part in (result, DEPENDENCE[self.dependence]) if part)
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Size of the differences, their share inside three standard deviations, and the sensors' own residuals."""
         if self.comparison is None or self.history is None:
             return ()
         nees, inside = self.comparison.mean_nees, self.comparison.share_inside
-        high = chi_square_quantile(self.confidence, 3)
+        high, name, covers = chi_square_quantile(self.confidence, 3), "attitude check", inside >= LEAST_INSIDE
         return (
-            ConsistencyCheck("attitude-nees", "attitude check size", nees, 0.0, high, nees <= high, self.remark),
-            ConsistencyCheck(
-                "attitude-coverage",
-                "attitude check share inside",
-                inside,
-                LEAST_INSIDE,
-                1.0,
-                inside >= LEAST_INSIDE,
-                self.remark,
-            ),
-            *(
-                ConsistencyCheck(**{**vars(v), "name": f"attitude check {v.name}"})
-                for v in self.history.consistency_checks
-            ),
+            Check("attitude-nees", f"{name} size", nees, 0.0, high, nees <= high, self.remark),
+            Check("attitude-coverage", f"{name} share inside", inside, LEAST_INSIDE, 1.0, covers, self.remark),
+            *(replace(check, name=f"{name} {check.name}") for check in self.history.consistency_checks),
         )
 
 
@@ -673,7 +662,7 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
     elif telemetry.attitude_prior is None:
         dependence = "start"
     history, comparison = None, None
-    found: list[Finding] = []
+    found: list[Issue] = []
     try:
         t, points = track(telemetry)
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
@@ -683,7 +672,7 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
         comparison = compare_attitudes(history, bet.smoothed, settings.check_confidence)
         found += history.findings
     except GateError as fault:
-        found.append(Finding("attitude check", str(fault), np.nan, np.nan, "attitude-check-missing"))
+        found.append(Issue(str(fault), "attitude-check-missing", "attitude check"))
     return AttitudeCheck(history, comparison, dependence, tuple(found), settings.check_confidence)
 
 

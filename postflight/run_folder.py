@@ -31,16 +31,15 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import events
-from flightmodel.checks import DivergenceError, Fault, FloatArray, GateError
+from flightmodel.checks import Check, DivergenceError, FloatArray, GateError, Issue
 from flightmodel.deflection import mean_over
 from flightmodel.earth import WGS84, name_of
 from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
-from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections, no_answer_at, quantiles_at
 from postflight.flight import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
-from recon.consistency import ConsistencyCheck
 from recon.measurements import component_unit
 
 DIGITS = "%.10g"
@@ -95,7 +94,7 @@ class RunFolder:
         self.name = name
         self.as_read = as_read
         self.finished: datetime | None = None
-        self.left_out: list[Fault] = []
+        self.left_out: list[Issue] = []
         self.settings = settings
         self.telemetry = telemetry
         self.parent = flight_folder / "runs"
@@ -140,7 +139,7 @@ class RunFolder:
         try:
             yield
         except (GateError, DivergenceError) as fault:
-            self.left_out.append(Fault(f"{name}: {fault}", fault.codes[0]))
+            self.left_out.append(Issue(f"{name}: {fault}", fault.codes[0]))
 
     def write_facts(self) -> datetime:
         """Write ``run.json`` and return the run's time."""
@@ -174,7 +173,7 @@ class RunFolder:
                 continue
             self.path = final
             return
-        raise GateError(f"{final}: other processes write the same run; run it again", "run-contended")
+        raise GateError(f"{final}: other processes write the same run; run it again", "cannot-write")
 
     def write_csv(self, name: str, table: pd.DataFrame) -> None:
         """Write a table."""
@@ -308,17 +307,17 @@ def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflec
         run.write_csv("density_by_drag.csv", flight.density)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         run.write_csv("attitude_check.csv", attitude_table(flight.attitude, bet))
-    findings = [vars(f) for f in (*flight.findings, *without_attitude(flight))]
+    findings = [f.as_row() for f in (*flight.findings, *without_attitude(flight))]
     run.write_csv("findings.csv", pd.DataFrame(findings, columns=["source", "what", "start_s", "end_s", "code"]))
     return event_rows
 
 
-def without_attitude(flight: Reconstruction) -> tuple[Finding, ...]:
+def without_attitude(flight: Reconstruction) -> tuple[Issue, ...]:
     """Finding on the empty columns of a flight without inertial sensors; none with them."""
     if flight.has_attitude:
         return ()
     words = "no inertial sensors carried the attitude: attitude, rates and flow angles are empty in bet.csv"
-    return (Finding("attitude", words, np.nan, np.nan, "attitude-missing"),)
+    return (Issue(words, "attitude-missing", "attitude"),)
 
 
 def write_all_checks(run: RunFolder, flight: Reconstruction, answers: Deflections | None) -> None:
@@ -332,9 +331,9 @@ def write_all_checks(run: RunFolder, flight: Reconstruction, answers: Deflection
     )
 
 
-def write_checks(run: RunFolder, checks: Iterable[ConsistencyCheck]) -> pd.DataFrame:
+def write_checks(run: RunFolder, checks: Iterable[Check]) -> pd.DataFrame:
     """Write ``consistency_checks.csv``, and return it."""
-    table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(ConsistencyCheck)])
+    table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(Check)])
     run.write_csv("consistency_checks.csv", table)
     return table
 

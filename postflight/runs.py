@@ -41,7 +41,7 @@ def check_name(name: str) -> str:
     """Return the name if a run may have it, or raise `ConfigError`: it becomes part of a folder's name."""
     if not _NAME.fullmatch(name) or name == PLAIN:
         words = f"--name {name!r}: letters, digits, '.', '_' and '-', at most 40 of them, are wanted; not '{PLAIN}'"
-        raise ConfigError(words, "run-name")
+        raise ConfigError(words, "option-format")
     return name
 
 
@@ -91,8 +91,8 @@ def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
     Raises
     ------
     GateError
-        ``run-missing`` where the flight has no complete run, ``run-unknown`` where none is so called,
-        ``run-incomplete``, ``run-of-another`` where the folder is not one, or of another flight.
+        ``run-missing`` where the flight has no complete run, ``name-unknown`` where none is so called,
+        ``run-incomplete``, ``run-missing`` where the folder is not one, or of another flight.
     """
     runs = complete_runs(flight_folder)
     named = {name for run in runs for name in _names(run)}
@@ -113,14 +113,14 @@ def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
     known = [PLAIN, *(name for run in runs[-_SHOWN:] for name in _names(run))]
     listed = "; ".join(f"{run.name} ({_about(facts_of(run))})" for run in runs[-_SHOWN:])
     words = f"{flight_folder}: no complete run '{wanted}'{nearest_name(wanted, known)}; there are: {listed}"
-    raise GateError(words, "run-unknown")
+    raise GateError(words, "name-unknown")
 
 
 def _whole(flight_folder: Path, run: Path) -> Path:
     """Return the folder of a run of this flight, or raise `GateError` with what it lacks."""
     if run.resolve().parent != (flight_folder / "runs").resolve():
         words = f"{run}: no run of {flight_folder}, whose runs lie in {flight_folder / 'runs'}"
-        raise GateError(words, "run-of-another")
+        raise GateError(words, "run-missing")
     missing = [name for name in _COMPLETE if not (run / name).is_file()]
     if missing:
         words = f"{run}: no complete run, without {', '.join(missing)}; `postflight run` leaves one, `reconcile` and "

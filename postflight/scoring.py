@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import Fault, FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, Issue
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
@@ -47,7 +47,7 @@ class Score(Tabular):
     peak_s: float
     methods: dict[str, dict[str, Any]]
     bet: dict[str, float]
-    failures: tuple[Fault, ...]
+    failures: tuple[Issue, ...]
     vehicle: str = ""
 
     def to_frame(self) -> pd.DataFrame:
@@ -87,21 +87,21 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
     refused = read_back(run / "summary.json", "methods")["methods"]
     methods: dict[str, dict[str, Any]] = {}
-    failures: list[Fault] = []
+    failures: list[Issue] = []
     written = {path.stem for path in run.glob("*.csv")}
     for method in METHODS:
         row = _method_row(run / f"{answer_table(method, written)}.csv", peak_s, true_deg)
         methods[method] = row
         if row["deflection_deg"] is None and refused.get(method, {}).get("applicable", True):
             reason = refused.get(method, {}).get("reason", "not run")
-            failures.append(Fault(f"{method}: no answer at peak ({reason})", "deflection-missing"))
+            failures.append(Issue(f"{method}: no answer at peak ({reason})", "deflection-missing"))
         elif row["deflection_deg"] is not None and not abs(row["error_deg"]) <= LIMIT_SD * row["sd_deg"]:
             words = f"{method}: error {row['error_deg']:+.2f} deg beyond {LIMIT_SD:g} sd of {row['sd_deg']:.2f} deg"
-            failures.append(Fault(words, "deflection-error"))
+            failures.append(Issue(words, "deflection-error"))
     stated = tuple(name for names in BET_SD.values() for name in names)
     bet = _bet_errors(_read(run / "bet.csv", (*STATE_COLUMNS, "alpha_total_wind_deg", *stated)), truth)
     failures += [
-        Fault(f"BET {name}: {bet[name]:.3f} beyond {LIMIT_SD:g} sd of {bet[_sd(name)]:.3f}", "trajectory-error")
+        Issue(f"BET {name}: {bet[name]:.3f} beyond {LIMIT_SD:g} sd of {bet[_sd(name)]:.3f}", "trajectory-error")
         for name in BET_SD
         if np.isfinite(bet[_sd(name)]) and not bet[name] <= LIMIT_SD * bet[_sd(name)]
     ]
@@ -121,7 +121,7 @@ def _read(path: Path, columns: tuple[str, ...]) -> pd.DataFrame:
         return table.astype(dict.fromkeys(columns, float))
     except (OSError, ValueError, KeyError, pd.errors.ParserError, pd.errors.EmptyDataError) as fault:
         raise GateError(
-            f"{path}: cannot be read as a table with {', '.join(columns)}: {fault}", "table-unreadable"
+            f"{path}: cannot be read as a table with {', '.join(columns)}: {fault}", "file-unreadable"
         ) from None
 
 

@@ -34,7 +34,6 @@ from recon.settings import Settings
 
 MASS_PART = 0.01
 PULSE_STEP_S = 0.1
-LEAST_GAIN = 0.02  # least relative change of a variance by which a change can be judged
 COLUMNS = (
     "rerun", "quantity", "unit", "t_s", "base", "base_sd", "change", "change_over_sd", "expected_sd",
     "change_over_expected_sd", "largest_change", "largest_at_s", "reason",
@@ -68,10 +67,8 @@ GROUPS = {
     "position": ("position north", "position east", "altitude"),
     "velocity": ("velocity north", "velocity east", "velocity down"),
     "attitude": ("rotation about body x", "rotation about body y", "rotation about body z"),
-    **{
-        name: (name,)
-        for name in ("total angle of attack", "Mach number", "dynamic pressure", "density of the day", "C_A")
-    },
+} | {
+    name: (name,) for name in ("total angle of attack", "Mach number", "dynamic pressure", "density of the day", "C_A")
 }
 
 
@@ -171,30 +168,20 @@ def _rows(rerun: Rerun, base: Reconstruction, own: Reconstruction, other: Recons
     change = views[2].minus(views[0])
     out: list[dict[str, object]] = []
     for name, unit in UNITS.items():
-        moved, sd = change[name], views[0].sd[name]
-        if not np.isfinite(sd[peak]):
+        moved, (sd, own_sd, other_sd) = change[name], (view.sd[name][peak] for view in views)
+        if not np.isfinite(sd):
             continue
-        gained = rerun.data * (views[1].sd[name][peak] ** 2 - views[2].sd[name][peak] ** 2)
-        sharp = gained > LEAST_GAIN * views[0].sd[name][peak] ** 2
-        expected = float(np.sqrt(gained)) if sharp else np.nan
+        gained = rerun.data * (own_sd**2 - other_sd**2)
+        # a change can be judged where the variance changes by so much
+        expected = float(np.sqrt(gained)) if gained > 0.02 * sd**2 else np.nan
         largest = int(np.nanargmax(np.abs(moved))) if np.isfinite(moved).any() else peak
-        out.append(
-            {
-                "rerun": rerun.name,
-                "quantity": name,
-                "unit": unit,
-                "t_s": at[peak],
-                "base": views[0].value[name][peak] if name in views[0].value else np.nan,
-                "base_sd": sd[peak],
-                "change": moved[peak],
-                "change_over_sd": moved[peak] / sd[peak],
-                "expected_sd": expected,
-                "change_over_expected_sd": moved[peak] / expected,
-                "largest_change": moved[largest],
-                "largest_at_s": at[largest],
-                "reason": "",
-            }
-        )
+        value = views[0].value[name][peak] if name in views[0].value else np.nan
+        here = moved[peak]
+        row = (
+            rerun.name, name, unit, at[peak], value, sd, here, here / sd, expected, here / expected, moved[largest],
+            at[largest], "",
+        )  # fmt: skip
+        out.append(dict(zip(COLUMNS, row, strict=True)))
     return out
 
 
@@ -206,7 +193,7 @@ def _times(base: Reconstruction, other: Trajectory) -> tuple[FloatArray, int]:
         raise GateError(
             f"reaches from {other.time_s[0]:.3f} to {other.time_s[-1]:.3f} s only; the largest dynamic pressure is at "
             f"{peak_s:.3f} s",
-            code="rerun-span",
+            code="time-not-covered",
         )
     pulse = t[pressure_pulse(base.air.dynamic_pressure_pa)]
     pulse = pulse[(pulse >= other.time_s[0]) & (pulse <= other.time_s[-1])]

@@ -2,12 +2,11 @@
 
 A name in a delivery may hold escape sequences that rewrite what stands above, or bidirectional marks that show a number
 backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only. Beside the streams of a
-command's process stand its threads and its memory.
+command's process stand its threads.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import unicodedata
@@ -16,10 +15,6 @@ from functools import wraps
 from typing import Any, ParamSpec, TextIO, TypeVar
 
 _HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}  # control, format (bidi, zero width), half a character, line ends
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of malloc.h
-# a map of its own is cleared page by page whenever it is made: smaller arrays come and go all the time
-_LARGE_BYTES, _HELD_BYTES = 4 << 20, 64 << 20
-_LARGEST_KEPT_BYTES = 32 << 20  # more the C library does not take
 _KEPT = {"\n", "\t"}
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -99,42 +94,3 @@ def on_one_thread(work: Callable[_P, _R]) -> Callable[_P, _R]:
             return work(*arguments, **named)
 
     return limited
-
-
-def leave_arrow_out() -> None:
-    """Load pandas as it is where Arrow is not installed; not where either is loaded already.
-
-    pandas only keeps text with it, of which a run has little, and it takes 35 MB of each process.
-    """
-    if "pandas" not in sys.modules and "pyarrow" not in sys.modules:
-        absent: dict[str, Any] = {"pyarrow": None}  # what `import` takes as not installed
-        sys.modules.update(absent)
-        try:
-            import pandas  # noqa: F401
-        finally:
-            del sys.modules["pyarrow"]
-
-
-def return_large_arrays(from_bytes: int = _LARGE_BYTES) -> None:
-    """Let each array of so many bytes or more be a map of its own, which the system has back as soon as it is freed.
-
-    The GNU C library by itself raises that size to the largest array that was freed so far (32 MB at most): those of a
-    filter pass then lie on the heap, where what is left between them keeps 40 MB of a run. Of what is free at the end
-    of the heap it may hold `_HELD_BYTES`. Threads share one heap: each of their own keeps as much, 40 MB of a run. Of
-    another C library nothing is asked.
-    """
-    from ctypes import CDLL
-
-    with contextlib.suppress(AttributeError, OSError, TypeError):
-        library = CDLL(None)
-        library.mallopt(_M_MMAP_THRESHOLD, from_bytes)
-        library.mallopt(_M_TRIM_THRESHOLD, _HELD_BYTES)
-        library.mallopt(_M_ARENA_MAX, 1)
-
-
-def keep_arrays() -> None:
-    """Let the memory of arrays be used again by those of the next flights, which are as large.
-
-    Handed back, it is cleared page by page anew: a quarter of the processor time of short flights.
-    """
-    return_large_arrays(_LARGEST_KEPT_BYTES)

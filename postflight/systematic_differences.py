@@ -68,21 +68,21 @@ from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from postflight.intake.other_trajectory import OtherTrajectory
 
-_MOST_EPOCHS = 800  # the effects are smooth; their covariance is a matrix of nine times as many rows
 _LEAST_EPOCHS = 20  # fewer decide nothing among so many effects
 _LEAST_ODDS = np.log(1000.0)  # for one more effect
 _CONFIDENCE = 0.999  # one false alarm in a thousand comparisons
-_STEPS = 5  # of Gauss-Newton: the effects are nearly linear
 _FAR_S, _FAR_STEP_S = 40.0, 0.25  # of time offsets that are looked for: leap seconds, a second's slip
 _MARGIN_S = 2.0 * _FAR_STEP_S  # about each of them
 # resolution of files: below it nothing is claimed (m, m/s, rad)
 _RESOLUTION = np.repeat([1e-3, 1e-3, np.deg2rad(1e-4)], 3)
-_DESIGN_STEPS = 40  # towards the optimal weights; any weights give a bound, these are within percents of the least
-_GEOID_ERROR_M = 1.0  # of EGM96 by the half degree, 1 sd
-_LEAST_UNDULATION_M = 5.0  # where a datum can be separated from a shift
-GROUPS = ("position", "velocity", "attitude")
-_UNITS = {"position": "m", "velocity": "m/s", "attitude": "deg"}
 _NED, _BODY = ("north", "east", "down"), ("x", "y", "z")
+# part of the difference: unit in a column's name and in words, scale from SI, axes
+_GROUPS = {
+    "position": ("m", "m", 1.0, _NED),
+    "velocity": ("mps", "m/s", 1.0, _NED),
+    "attitude": ("deg", "deg", 180.0 / np.pi, _BODY),
+}
+GROUPS = tuple(_GROUPS)
 # effect: components, unit, scale from SI, step of the numerical derivative, parts of the difference that show it
 _EFFECTS: dict[str, tuple[tuple[str, ...], str, float, float, tuple[str, ...]]] = {
     "time-offset": (("",), "ms", 1e3, 1e-3, GROUPS),
@@ -190,27 +190,22 @@ class SystematicDifferences(Tabular):
             for effect in self.effects
             for row in zip(effect.components, effect.value, effect.sd, effect.stated_sd, strict=True)
         ]
-        return pd.DataFrame(
-            rows, columns=["effect", "component", "value", "sd", "stated_sd", "unit", "stated_size", "beyond"]
-        )
+        names = ["effect", "component", "value", "sd", "stated_sd", "unit", "stated_size", "beyond"]
+        return pd.DataFrame(rows, columns=names)
 
     def histories(self) -> pd.DataFrame:
         """Differences over time, as given and ``left``, with their sd; units in the columns' names."""
         columns = {"t_s": self.time_s}
-        for k, (name, unit, scale) in enumerate(self._columns()):
-            for what, values in (("", self.given), ("_left", self.left), ("_sd", self.sd)):
-                columns[f"{name}{what}_{unit}"] = scale * values[:, k]
+        for at, group in enumerate(self.groups):
+            unit, _, scale, axes = _GROUPS[group]
+            for k, axis in enumerate(axes, 3 * at):
+                for what, values in (("", self.given), ("_left", self.left), ("_sd", self.sd)):
+                    columns[f"{group}_{axis}{what}_{unit}"] = scale * values[:, k]
         return pd.DataFrame(columns)
-
-    def _columns(self) -> list[tuple[str, str, float]]:
-        units = {"position": ("m", 1.0), "velocity": ("mps", 1.0), "attitude": ("deg", 180.0 / np.pi)}
-        axes = {"attitude": _BODY}
-        return [(f"{group}_{axis}", *units[group]) for group in self.groups for axis in axes.get(group, _NED)]
 
     def rms(self, group: str) -> tuple[float, float]:
         """Root mean square of the difference's size as given and less the effects, in m, m/s, deg."""
-        at = 3 * self.groups.index(group)
-        scale = 180.0 / np.pi if group == "attitude" else 1.0
+        at, scale = 3 * self.groups.index(group), _GROUPS[group][2]
         given, left = (
             scale * float(np.sqrt((d[:, at : at + 3] ** 2).sum(axis=1).mean())) for d in (self.given, self.left)
         )
@@ -228,15 +223,14 @@ class SystematicDifferences(Tabular):
         changes = []
         for group in self.groups:
             given, left = self.rms(group)
-            change = f"{group} {_short(given)}" + (f" to {_short(left)}" if found else "")
-            changes.append(f"{change} {_UNITS[group]}")
+            change = f"{group} {given:.3g}" + (f" to {left:.3g}" if found else "")
+            changes.append(f"{change} {_GROUPS[group][1]}")
         words += f"Rms of the difference: {', '.join(changes)}. "
         given, left, limit = self.chi_square["all"]
         whose = "both covariances" if self.both_stated else "the run's covariance alone (the other states none)"
-        words += f"Chi-square per degree of freedom with {whose}: {_short(given)}"
-        words += f", {_short(left)} less these. " if found else ". "
-        last = left if found else given
-        if last > limit:
+        words += f"Chi-square per degree of freedom with {whose}: {given:.3g}"
+        words += f", {left:.3g} less these. " if found else ". "
+        if (left if found else given) > limit:
             words += f"Above {limit:.1f} the covariances do not explain the difference, however correlated in time. "
         words += "Errors of the two are taken as independent; where they share data less is allowed."
         return words
@@ -248,10 +242,6 @@ class SystematicDifferences(Tabular):
 def digits(sd: float) -> int:
     """Decimals in which a value with this sd is printed: two digits of the sd."""
     return max(0, min(6, 1 - int(np.floor(np.log10(max(float(sd), 1e-6))))))
-
-
-def _short(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def systematic_differences(
@@ -271,18 +261,15 @@ def systematic_differences(
     Raises
     ------
     GateError
-        ``no-common-time`` where fewer than 20 of the other's epochs lie in the run.
+        ``time-not-covered`` where fewer than 20 of the other's epochs lie in the run.
     """
-    best: _Explained | None = None
     run = _with_rates(run)
     stated = covariance_time_s, covariance
     starts = [s for s in (0.0, *_far_offset(run, other)) if _covered(run, other.time_s, s).sum() >= _LEAST_EPOCHS]
-    for start_s in starts or [0.0]:
-        explained = _Fit(run, stated, other, start_s).explained()
-        if best is None or explained.score > best.score:
-            best = explained
-    assert best is not None
-    if np.abs(best.fit.undulation_m).min() > _LEAST_UNDULATION_M:
+    found = [_Fit(run, stated, other, start_s).explained() for start_s in starts or [0.0]]
+    best = max(found, key=lambda explained: explained.score)
+    # where the geoid is so far from the ellipsoid, a datum can be separated from a shift
+    if np.abs(best.fit.undulation_m).min() > 5.0:
         best = _with_datum(best, _Fit(run, stated, other, best.fit.start_s, datum=True))
     return _result(best)
 
@@ -350,18 +337,16 @@ class _Fit:
     ) -> None:
         use = np.flatnonzero(_covered(run, other.time_s, start_s))
         if len(use) < _LEAST_EPOCHS:
-            words = f"{len(use)} of its epochs lie in the run ({_span(run.time_s)}); its own are {_span(other.time_s)}"
-            raise GateError(f"{other.label}: {words}; {_LEAST_EPOCHS} are wanted", "no-common-time")
-        use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), _MOST_EPOCHS)).astype(int))]
+            spans = [f"{t[0]:.2f} to {t[-1]:.2f} s" for t in (run.time_s, other.time_s)]
+            words = f"{len(use)} of its epochs lie in the run ({spans[0]}); its own are {spans[1]}"
+            raise GateError(f"{other.label}: {words}; {_LEAST_EPOCHS} are wanted", "time-not-covered")
+        # the effects are smooth; their covariance is a matrix of nine times as many rows
+        use = use[np.unique(np.linspace(0, len(use) - 1, min(len(use), 800)).astype(int))]
         self.run, self.stated, self.other, self.use, self.start_s, self.datum = run, stated, other, use, start_s, datum
         self.time_s = other.time_s[use]
         has_attitude = bool(np.isfinite(run.q_ecef_body).all())
-        known = {
-            "position": True,
-            "velocity": other.velocity_ecef_mps is not None,
-            "attitude": has_attitude and other.q_ecef_body is not None,
-        }
-        self.groups = tuple(group for group in GROUPS if known[group])
+        known = True, other.velocity_ecef_mps is not None, has_attitude and other.q_ecef_body is not None
+        self.groups = tuple(group for group, is_known in zip(GROUPS, known, strict=True) if is_known)
         self.parts = np.concatenate([np.arange(3) + 3 * GROUPS.index(group) for group in self.groups])
         self.known: dict[float, Trajectory] = {}
         whole = self._run_at(start_s)
@@ -374,22 +359,17 @@ class _Fit:
         latitude, longitude, _ = earth.geodetic_from_ecef(self.centre_m, whole.planet)
         self.first = earth.dcm_ned_ecef(float(latitude), float(longitude))
         self.names = tuple(
-            name for name, (*_, shown) in _EFFECTS.items() if self._can_be_seen(name, shown, has_attitude)
+            name
+            for name, (*_, shown) in _EFFECTS.items()
+            if set(shown) & set(self.groups) and (has_attitude or name != "other-point")
         )
-        self.slices: dict[str, slice] = {}
-        at = 0
-        for name in self.names:
-            self.slices[name] = slice(at, at + len(_EFFECTS[name][0]))
-            at = self.slices[name].stop
-        self.count = at
+        sizes = [len(_EFFECTS[name][0]) for name in self.names]
+        ends = np.cumsum(sizes).tolist()
+        self.slices = {name: slice(end - n, end) for name, n, end in zip(self.names, sizes, ends, strict=True)}
+        self.count = sum(sizes)
         self.covariances = _stated(self)
         self.covariance = np.sum(self.covariances, axis=0) + np.diag(_RESOLUTION[self.parts] ** 2)
         self.root = np.linalg.cholesky(self.covariance)
-
-    def _can_be_seen(self, name: str, shown: tuple[str, ...], has_attitude: bool) -> bool:
-        if name == "other-point" and not has_attitude:
-            return False
-        return bool(set(shown) & set(self.groups))
 
     def _run_at(self, offset_s: float) -> Trajectory:
         """The run at the epochs less a time offset; the last few are kept, as derivatives ask for one again."""
@@ -411,9 +391,8 @@ class _Fit:
             place = place + self.undulation_m[:, None] * self.dcm_ned_ecef[:, 2]
         velocity = rotations.rotate(turn, path.velocity_ecef_mps)
         if "inertial-velocity" in get:
-            velocity = velocity + get["inertial-velocity"][0] * np.cross(
-                path.planet.rate_ecef_radps, path.position_ecef_m
-            )
+            carried = np.cross(path.planet.rate_ecef_radps, path.position_ecef_m)
+            velocity = velocity + get["inertial-velocity"][0] * carried
         if "other-point" in get:
             arm = rotations.rotate(path.q_ecef_body, np.broadcast_to(get["other-point"], (len(self.time_s), 3)))
             rate = rotations.rotate(path.q_ecef_body, path.omega_body_eci_body_radps) - path.planet.rate_ecef_radps
@@ -445,10 +424,8 @@ class _Fit:
         """The effects that the difference bears, added one by one and dropped where others have made them needless."""
         current = self.solved(("time-offset",) if self.start_s else ())
         while len(current.names) < len(self.names):
-            trials = [
-                self.solved((*current.names, name), current.x) for name in self.names if name not in current.names
-            ]
-            trials = [trial for trial in trials if self._possible(trial)]
+            more = [(*current.names, name) for name in self.names if name not in current.names]
+            trials = [trial for names in more if self._possible(trial := self.solved(names, current.x))]
             best = max(trials, key=lambda t: t.odds_over(current), default=None)
             if best is None or best.odds_over(current) < _LEAST_ODDS:
                 # a lasting effect can look like one long correlated error, of a size that the covariances exclude
@@ -483,7 +460,8 @@ class _Fit:
         left = self.difference(x)
         noise = _Noise.of(left, self.parts)
         slope = self.jacobian(x, names) if names else np.empty((*left.shape, 0))
-        for step in range(_STEPS if names else 0):
+        # a few steps of Gauss-Newton: the effects are nearly linear
+        for step in range(5 if names else 0):
             if step:
                 a, b = slope / noise.sd_effective[:, None], left / noise.sd_effective
             else:
@@ -656,7 +634,8 @@ def _best_seen(information: FloatArray, asked: BoolArray) -> FloatArray:
     """Weights (n,) of epochs near the D_s-optimal design of the parameters asked for; information is (n, p, p)."""
     weight = np.full(len(information), 1.0 / len(information))
     others = ~asked
-    for _ in range(_DESIGN_STEPS):
+    # towards the optimal weights; any weights give a bound, these are within percents of the least
+    for _ in range(40):
         whole = np.einsum("n,npq->pq", weight, information)
         seen = np.einsum("pq,nqp->n", _pseudo_inverse(whole), information)
         inverse = _pseudo_inverse(whole[others][:, others])
@@ -693,7 +672,7 @@ def _result(best: _Explained) -> SystematicDifferences:
     effects = []
     if fit.datum:
         higher = np.array([-float(fit.undulation_m.mean())])
-        error = np.array([_GEOID_ERROR_M])
+        error = np.array([1.0])  # of EGM96 by the half degree, 1 sd
         effects.append(FoundEffect("height-datum", ("",), higher, error, np.full(1, np.nan), "m"))
     for name in best.names:
         components, unit, scale, *_ = _EFFECTS[name]
@@ -712,19 +691,9 @@ def _result(best: _Explained) -> SystematicDifferences:
         before, after = (float(np.einsum("ni,nij,nj->n", d, inverse, d).mean()) for d in both)
         degrees = len(rows)
         chi_square[group] = before / degrees, after / degrees, chi_square_quantile(_CONFIDENCE, degrees) / degrees
+    by_both_sd = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+    both_stated = len(fit.covariances) > 1
     return SystematicDifferences(
-        other.label,
-        fit.time_s,
-        given,
-        best.left,
-        np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2)),
-        fit.groups,
-        tuple(effects),
-        chi_square,
-        len(fit.covariances) > 1,
+        other.label, fit.time_s, given, best.left, by_both_sd, fit.groups, tuple(effects), chi_square, both_stated,
         other.notes,
-    )
-
-
-def _span(time_s: FloatArray) -> str:
-    return f"{time_s[0]:.2f} to {time_s[-1]:.2f} s"
+    )  # fmt: skip

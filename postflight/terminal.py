@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +15,13 @@ from rich import progress as bars
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
+from rich.table import Table
 
 from flightmodel.checks import Progress
 from postflight.streams import into_nothing, visible
 
 if TYPE_CHECKING:  # a first line waits for no numpy
-    from flightmodel.telemetry import Finding
+    from flightmodel.checks import Issue
 
 
 class Terminal(Console):
@@ -35,6 +36,18 @@ class Terminal(Console):
         """Print a finding, refusal or failed check behind its mark, with its code in brackets at the end."""
         self.print(f"{mark} {escape(words + (f' [{code}]' if code else ''))}", highlight=False)
 
+    def table(
+        self, title: str, names: Iterable[str], rows: Iterable[Iterable[object]], words: Collection[str] = ()
+    ) -> None:
+        """Print a table: its first column and those named in ``words`` are texts, the others numbers."""
+        printed = Table(title=escape(title))
+        for k, name in enumerate(names):
+            is_text = not k or name in words
+            printed.add_column(name, justify="left" if is_text else "right", no_wrap=not k)
+        for row in rows:
+            printed.add_row(*(escape(str(cell)) for cell in row))
+        self.print(printed)
+
     def on_broken_pipe(self) -> None:
         """Go on: results are written to files, whoever reads."""
         into_nothing(self.file)
@@ -48,15 +61,15 @@ def terminal(**options: Any) -> Terminal:
 MOST_ALIKE = 5  # findings of one kind that a reader wants line by line
 
 
-def few_of_each(findings: Iterable[Finding]) -> list[tuple[str, str]]:
+def few_of_each(findings: Iterable[Issue]) -> list[tuple[str, str]]:
     """Words and code of findings; of many of one source and code the first, and how many more there are, until when."""
-    alike: dict[tuple[str, str], list[Finding]] = {}
+    alike: dict[tuple[str, str], list[Issue]] = {}
     for finding in findings:
         alike.setdefault((finding.source, finding.code), []).append(finding)
     out = []
     for (source, code), same in alike.items():
         shown = same if len(same) <= MOST_ALIKE else same[: MOST_ALIKE - 1]
-        out += [(str(finding), code) for finding in shown]
+        out += [(finding.line, code) for finding in shown]
         if len(shown) < len(same):
             until = f", the last until {same[-1].end_s:.3f} s" if math.isfinite(same[-1].end_s) else ""
             out.append((f"{source}: {len(same) - len(shown)} more of these{until}", code))

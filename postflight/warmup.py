@@ -1,29 +1,29 @@
-"""How are kernels compiled before their first use? Side by side in processes, with a message about the wait.
+"""How are kernels compiled before their first use? Side by side in processes, with progress.
 
 Kernels are compiled for the very processor they run on and kept in a cache whose name carries a hash of their sources
 (`flightmodel._kernels`). Without this a first command would compile them one after another, in silence. Each group
 calls its kernels once on a tiny problem; a file in the cache marks it as compiled.
-
-Run as ``python -m postflight.warmup GROUP ...`` it compiles these groups in its own process.
 """
 
 from __future__ import annotations
 
 import gc
 import hashlib
+import math
 import os
-import subprocess
-import sys
+import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
 
 from flightmodel import earth
-from flightmodel._compiler_kernels import list_variables_by_type, remember_operators
 from flightmodel._kernels import CACHE
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
+from postflight.beside import worker_pool
 from recon import ekf, propagation, smoother
 from recon.ekf import Problem, observe
 from recon.measurements import Instrument
@@ -116,15 +116,6 @@ def _smoothers() -> None:
     propagation.propagate(problem.motion, 0, 1, problem.start)
 
 
-def _tables() -> None:
-    from flightmodel import _csv_kernels as kernels
-
-    data, slots = np.frombuffer(b"1.5\n\0\0\0", dtype=np.uint8).copy(), np.zeros(1, dtype=np.int64)
-    powers = kernels.powers_of_five()
-    spans = np.empty((2, 0), dtype=np.int64)
-    kernels.read_rows(data, 0, 4, slots, kernels.EXACT_TENS, *powers, np.empty((1, 1)), spans, 0)
-
-
 def _balance() -> None:
     from estimators import _balance_kernels as kernels
 
@@ -172,14 +163,16 @@ GROUPS: dict[str, Callable[[], None]] = {
     "ensembles": _ensembles,
     "creep": _creep,
     "balance": _balance,
-    "tables": _tables,
     "spans": _spans,
 }
-# what shares its parts: in one process these are compiled once. With the seconds that it takes; only ratios count
-_FAMILIES: dict[tuple[str, ...], int] = {
-    ("filter", "smoothers"): 18, ("camera",): 18, ("simulator", "ensembles", "creep"): 8, ("balance",): 3,
-    ("tables",): 2, ("spans",): 2,
+# what shares its parts: in one process these are compiled once
+_FAMILIES = (("filter", "smoothers"), ("simulator", "ensembles", "creep"))
+# time of each group where it is compiled in this order; only ratios count
+_SECONDS = {
+    "camera": 18.0, "filter": 14.0, "smoothers": 4.0, "simulator": 4.0, "ensembles": 3.0, "creep": 2.0, "balance": 3.0,
+    "spans": 2.0,
 }  # fmt: skip
+_LOOK_S = 0.2  # between two looks at what is compiled
 RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
 
@@ -197,74 +190,89 @@ def missing(groups: Iterable[str]) -> list[str]:
     return [group for group, stamp in stamps if stamp is not None and not stamp.exists()]
 
 
-def prepare(groups: Iterable[str], report: Callable[[str], None]) -> None:
-    """Compile what is missing, in as many processes as there are processors: each begins with a second of imports.
+def prepare(groups: Iterable[str], report: Progress) -> dict[str, str]:
+    """Compile what is missing, in as many processes as there are processors.
 
     Parameters
     ----------
     groups : iterable of str
         Keys of `GROUPS`.
     report : callable
-        Takes a message: what is compiled, and each group that failed here and will be compiled at its first use.
+        Takes the part of the time that is over, and which groups are being compiled.
+
+    Returns
+    -------
+    dict of str
+        Groups that failed here, and will be compiled at their first use, with the reason.
     """
     wanted = missing(groups)
-    if not wanted:
-        return
-    report(f"compiling kernels for this machine, once (a quarter of a minute to one minute): {', '.join(wanted)}")
-    quiet, command = subprocess.DEVNULL, [sys.executable, "-m", "postflight.warmup"]
-    plain = {**os.environ, "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}  # numba colours thousands that it drops
-    shares = _shares(wanted, len(os.sched_getaffinity(0)))
-    running = [
-        subprocess.Popen(
-            [*command, *share], env=plain, stdin=quiet, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        for share in shares
-    ]
-    try:
-        for share, process in zip(shares, running, strict=True):
-            failed, why = process.communicate()
-            reasons = dict(line.split("\t", 1) for line in failed.splitlines())
-            if process.returncode:  # ended before its time
-                last = why.strip().splitlines()[-1] if why.strip() else f"exit code {process.returncode}"
-                reasons = dict.fromkeys(missing(share), last) | reasons
-            for group, reason in reasons.items():
-                report(f"kernels of {group} were not compiled beforehand, but will be at their first use: {reason}")
-    except BaseException:
-        for process in running:
-            process.terminate()
-        raise
+    shares = _shares(wanted)
+    if not shares:
+        return {}
+    failed: dict[str, str] = {}
+    with worker_pool(min(len(shares), len(os.sched_getaffinity(0)))) as pool:
+        running = {pool.submit(_compile, share): share for share in shares}
+        watch, waiting = _Watch(shares), set(running)
+        while waiting:
+            done, waiting = wait(waiting, _LOOK_S)
+            report(*watch.look())
+            for future in done:
+                try:
+                    failed |= future.result()
+                except BrokenProcessPool as fault:
+                    failed |= dict.fromkeys(missing(running[future]), str(fault))
+    return failed
 
 
-def _shares(groups: list[str], processes: int) -> list[list[str]]:
-    """Deal groups, family by family, each to whom has the least to do; what is in none is a family of its own."""
-    known = {group for family in _FAMILIES for group in family}
-    families = [*_FAMILIES.items(), *(((group,), 1) for group in groups if group not in known)]
-    shares: list[list[str]] = [[] for _ in range(processes)]
-    load = [0] * processes
-    for family, seconds in families:
-        if wanted := [group for group in family if group in groups]:
-            least = load.index(min(load))
-            shares[least] += wanted
-            load[least] += seconds
-    return [share for share in shares if share]
+def _shares(groups: list[str]) -> list[list[str]]:
+    """Groups that are compiled in one process, the longest first."""
+    families = [*_FAMILIES, *((group,) for group in groups if not any(group in family for family in _FAMILIES))]
+    shares = [[group for group in family if group in groups] for family in families]
+    return sorted(filter(None, shares), key=lambda share: -sum(map(_seconds, share)))
 
 
-def _compile(groups: Iterable[str]) -> None:
-    """Compile groups in this process; those that fail are written with the reason."""
-    remember_operators()
-    list_variables_by_type()
-    gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a fifth of the time
+def _seconds(group: str) -> float:
+    return _SECONDS.get(group, 1.0)
+
+
+class _Watch:
+    """How far compiling is, by the groups whose mark is there and the time since it became a group's turn."""
+
+    def __init__(self, shares: list[list[str]]) -> None:
+        self._shares = shares
+        self._begun_s = time.monotonic()
+        self._since: dict[str, float] = {}
+
+    def look(self) -> tuple[float, str]:
+        """Part of the time that is over, and groups in work, of how many, with an estimate of what remains."""
+        now = time.monotonic()
+        left = [missing(share) for share in self._shares]
+        turn = [share[0] for share in left if share][: len(os.sched_getaffinity(0))]
+        every = [group for share in self._shares for group in share]
+        over = sum(map(_seconds, every)) - sum(_seconds(group) for share in left for group in share)
+        for group in turn:  # of what is not finished never all
+            whole = _seconds(group)
+            over += whole * -math.expm1(-(now - self._since.setdefault(group, now)) / (2.0 * whole))
+        part = over / sum(map(_seconds, every))
+        number = len(every) - sum(map(len, left)) + 1
+        words = f"compiling kernels, group {min(number, len(every))} of {len(every)}: {', '.join(turn) or every[-1]}"
+        taken_s = now - self._begun_s
+        if part > 0.05:
+            words += f"; {taken_s * (1.0 - part) / part:.0f} s remain"
+        return part, words
+
+
+def _compile(groups: list[str]) -> dict[str, str]:
+    """Compile groups in this process; return those that fail, with the reason."""
+    gc.set_threshold(200_000, 20, 50)  # a compiler makes many objects and hardly any circle: a sixth of the time
+    failed = {}
     for group in groups:
         try:
             GROUPS[group]()
         except Exception as fault:
-            sys.stdout.write(f"{group}\t{type(fault).__name__}: {fault}".splitlines()[0] + "\n")
+            failed[group] = f"{type(fault).__name__}: {fault}".splitlines()[0]
             continue
         stamp = _stamp(group)
         if stamp is not None:
             stamp.touch()
-
-
-if __name__ == "__main__":
-    _compile(sys.argv[1:])
-    gc.freeze()  # or all that was made is searched for garbage once more at the end
+    return failed

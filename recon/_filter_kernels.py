@@ -1,9 +1,9 @@
-"""Compiled error-state extended Kalman filter over nodes. Model and twin on filterpy: `recon.ekf`.
+"""Compiled error-state extended Kalman filter over nodes. Model, and the same on filterpy: `recon.ekf`.
 
 The transition is dense in its nine kinematic rows alone, so a prediction costs ``9 D N`` products instead of ``2 N^3``;
 a measurement's partials are dense in nine columns and its source's own errors.
 
-Compiled Rauch-Tung-Striebel smoother. Twin of the filterpy engine, and the equations: `recon.smoother`.
+Compiled Rauch-Tung-Striebel smoother. Equations: `recon.smoother`; readable twin: `tests.oracles.plain_smoother`.
 """
 
 from __future__ import annotations
@@ -46,12 +46,6 @@ def height_of(p, planet):
     """Geodetic height of a point (3,), m."""
     _, _, height, _ = geodetic(p[0], p[1], p[2], planet)
     return height
-
-
-@kernel
-def height(p, planet):
-    """`height_of` for callers in Python."""
-    return height_of(p, planet)
 
 
 @inlined
@@ -313,14 +307,7 @@ def update_node(motion, index, sources, observed, wander, gate, charts, innovati
         source = observed.source[row]
         slot, kind = sources.slot[source], sources.kind[source]
         by_state, by_error = innovations.by_state[row], innovations.by_error[row]
-        for col in range(SLOTS):
-            e[col] = charts.errors[k, slot[col]] if slot[col] >= 0 else 0.0
-        predict(
-            kind, sources.arm_body_m[source], sources.site_ecef_m[source], sources.dcm[source], observed.known[row], e,
-            position, velocity, c, rate, acceleration, h, by_state, by_error, motion.planet,
-        )  # fmt: skip
-        if kind == DECELERATION:
-            predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error)
+        predict_reading(motion, sources, observed, charts, k, row, c, rate, acceleration, e, h, by_state, by_error)
         count = 0
         for i in range(3):
             if math.isinf(observed.variance[row, i]):
@@ -345,6 +332,34 @@ def update_node(motion, index, sources, observed, wander, gate, charts, innovati
         innovations.accepted[row] = nis <= gate[count] and observed.usable[row]
         if innovations.accepted[row]:
             gain_and_update(x, p, w, y, factor, count, used, wander.considered, wander.sd, innovations.gain[row])
+
+
+@inlined
+def predict_reading(motion, sources, observed, charts, k, row, c, rate, acceleration, e, h, by_state, by_error):
+    """Prediction ``h`` (3,) of a measurement at the chart of node ``k``, and its partials.
+
+    ``c``, ``rate`` and ``acceleration`` are of `node_motion`; ``e`` (SLOTS,) is scratch.
+    """
+    source = observed.source[row]
+    slot, kind = sources.slot[source], sources.kind[source]
+    position, velocity = charts.position[k], charts.velocity[k]
+    for col in range(SLOTS):
+        e[col] = charts.errors[k, slot[col]] if slot[col] >= 0 else 0.0
+    predict(
+        kind, sources.arm_body_m[source], sources.site_ecef_m[source], sources.dcm[source], observed.known[row], e,
+        position, velocity, c, rate, acceleration, h, by_state, by_error, motion.planet,
+    )  # fmt: skip
+    if kind == DECELERATION:
+        predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error)
+
+
+@kernel
+def predict_one(motion, index, sources, observed, charts, k, row, h, by_state, by_error):
+    """`predict_reading` of one measurement, for the filterpy engine."""
+    c, rate, acceleration, e = np.empty((3, 3)), np.empty((12, 3)), np.empty(3), np.empty(SLOTS)
+    position, velocity = charts.position[k], charts.velocity[k]
+    node_motion(motion, index, position, velocity, charts.q[k], charts.errors[k], c, rate, acceleration)
+    predict_reading(motion, sources, observed, charts, k, row, c, rate, acceleration, e, h, by_state, by_error)
 
 
 @inlined

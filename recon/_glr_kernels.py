@@ -37,8 +37,8 @@ def offset_scores(steps, observed, slots, innovations, columns, begin, end, most
             slot = slots[observed.source[row]]
             adjoint_update(
                 innovations.by_state[row], innovations.by_error[row], slot, innovations.gain[row],
-                innovations.covariance[row], innovations.residual[row], observed.variance[row], mean, information, True,
-                rest, scratch,
+                innovations.covariance[row], innovations.residual[row], observed.variance[row], mean, information, rest,
+                scratch,
             )  # fmt: skip
             count = read_columns(innovations.by_state[row], innovations.by_error[row], slot, column, partials)
             for place in range(most):
@@ -62,7 +62,7 @@ def offset_scores(steps, observed, slots, innovations, columns, begin, end, most
                 cross_over_step(phi, steps.decay[k - 1], cross[place], old)
                 if begin[w] == k - 1:
                     active[place] = -1
-        adjoint_step(phi, steps.decay[k - 1], mean, information, old, product, True)
+        adjoint_step(phi, steps.decay[k - 1], mean, information, old, product)
 
 
 @inlined
@@ -125,7 +125,7 @@ def add_step(mean, response, moved, cross, score, variance):
 
 
 @inlined
-def adjoint_step(phi, decay, mean, information, old, product, wanted):
+def adjoint_step(phi, decay, mean, information, old, product):
     """``l = F^T l`` and ``L = F^T L F`` in place."""
     size, dense = len(mean), phi.shape[1]
     for j in range(size):
@@ -136,8 +136,6 @@ def adjoint_step(phi, decay, mean, information, old, product, wanted):
             for col in range(9):
                 value += phi[col, j] * old[col]
         mean[j] = value
-    if not wanted:
-        return
     for i in range(size):
         for j in range(size):
             product[i, j] = decay[j - 9] * information[i, j] if j >= 9 else 0.0
@@ -157,9 +155,7 @@ def adjoint_step(phi, decay, mean, information, old, product, wanted):
 
 
 @inlined
-def adjoint_update(
-    by_state, by_error, slot, gain, covariance, residual, variance, mean, information, wanted, rest, out
-):
+def adjoint_update(by_state, by_error, slot, gain, covariance, residual, variance, mean, information, rest, out):
     """Carry mean and information back over one measurement, in place.
 
     ``1 - K H`` is written out in the columns that the measurement reads (N, at most 9 + SLOTS, scratch): after a wide
@@ -184,8 +180,6 @@ def adjoint_update(
             response[a] -= weight[r, a] * residual[r]
     for a in range(count):
         mean[column[a]] = response[a]
-    if not wanted:
-        return
     multiply(information, rest, size, size, count, out)
     for i in range(size):
         for a in range(count):

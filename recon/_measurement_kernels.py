@@ -1,4 +1,5 @@
-"""Compiled measurement predictions and their partials. Model and numpy twin: `recon.measurements`.
+"""Compiled measurement predictions and their partials. Model: `recon.measurements`; readable twin:
+`tests.oracles.plain_measurements`.
 
 A kind fills ``h`` (3,), ``by_state`` (3, 9) by position, velocity, rotation, and ``by_error`` (3, `SLOTS`) by the
 source's own errors in the order of `recon.measurements.SLOT_NAMES`; ``e`` (SLOTS,) holds their values, zero where off.
@@ -10,7 +11,7 @@ import math
 
 import numpy as np
 
-from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined, kernel
+from flightmodel._kernels import RATE, boxplus, dcm_from_quaternion, geodetic, gravitation, inlined
 from recon._propagation_kernels import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
@@ -455,25 +456,3 @@ def predict_deceleration(motion, e, position, velocity, acceleration, h, by_stat
             by_error[i, j] = gain * partial[2 + j] if i == 0 and 4 <= j < 10 else 0.0
     h[0] = gain * (drag - e[3] * change) + e[0]
     by_error[0, 0], by_error[0, 1], by_error[0, 3] = 1.0, drag, -gain * change
-
-
-@kernel
-def deceleration_at(motion, e, position, velocity, acceleration, h, by_state, by_error):
-    """`predict_deceleration` for the filterpy engine and for tests."""
-    predict_deceleration(motion, e, position, velocity, acceleration, h, by_state, by_error)
-
-
-@kernel
-def predict_one(
-    kind, arm, site, dcm, known, e, position, velocity, q, rate, acceleration, h, by_state, by_error, planet
-):
-    """`predict` from an attitude quaternion, for the filterpy engine and for tests."""
-    c = np.empty((3, 3))
-    dcm_from_quaternion(q[0], q[1], q[2], q[3], c)
-    predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceleration, h, by_state, by_error, planet)
-
-
-@kernel
-def motion_at(motion, index, position, velocity, q, errors, rate, acceleration):
-    """`node_motion` without the attitude matrix, for the filterpy engine and for tests."""
-    node_motion(motion, index, position, velocity, q, errors, np.empty((3, 3)), rate, acceleration)

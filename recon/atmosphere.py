@@ -45,16 +45,16 @@ from flightmodel.atmosphere import (
     sounding_correlation,
     unresolved_variance,
 )
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError
 from flightmodel.statistics import correlation
 from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.consistency import data_sheet_check
 from recon.reconstruct import TrajectorySolution
 
-# a third of the winds' correlation length, a quarter of the trajectory's time
-_KNOT_M, _KNOT_S, _TRAJECTORY_TIME_S = 1000.0, 5.0, 20.0
+# a third of the winds' correlation length
+_KNOT_M, _TRAJECTORY_TIME_S = 1000.0, 20.0
 LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air measurably
 _LEAST_SAMPLES = 20  # windows: fewer say little of a profile
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
@@ -63,7 +63,6 @@ _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
 # log of the ratio of Mach numbers over which the error of C_A's shape forgets: about a flow regime, as the sources of
 # coefficients (ranges, tunnels, CFD) change from one to the next; assumed
 CA_SHAPE_LENGTH = float(np.log(2.0))
-_KNOT_LOG_MACH, _LEAST_MACH = 0.1, 0.1
 _BAD_DENSITY = (
     "is beyond the sounding's uncertainty: density, C_A, area or mass is wrong, which the drag does not separate; "
     "check the vehicle file and the sounding"
@@ -73,9 +72,6 @@ _BAD_DRAG = (
     "is beyond the pre-flight uncertainty: C_A, area, mass or density is wrong, which the drag does not separate; "
     "check the vehicle file and the sounding"
 )
-_LARGEST_RMS = 2.0
-_LEAST_STIFFNESS = 0.1  # share of the joint's stiffness that aerodynamic load leaves
-_CONVERGED_SD, _MOST_STEPS = 1e-2, 20  # far below any error; a bound
 # half the window over which sensors are averaged: well below the joint's period, well above the sampling interval
 HALF_WINDOW_S = 0.05
 _WINDOW_S = 0.4  # over which the joint's oscillation is averaged
@@ -156,13 +152,13 @@ class ReconstructedAir:
     parameters : DataFrame
         ``name, unit, prior_sd, estimate, sd`` of coefficient scales, gain and offsets. Scales are logs of flown over
         stated coefficient over mass, C_A's the mean over the pressure pulse.
-    consistency_checks : tuple of ConsistencyCheck
+    consistency_checks : tuple of Check
     """
 
     profile: pd.DataFrame
     drag: pd.DataFrame
     parameters: pd.DataFrame
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    consistency_checks: tuple[Check, ...]
 
 
 _PARAMETERS = {
@@ -206,7 +202,7 @@ class _Model:
         mach = speed / air.sound_speed_mps
         body = lateral_angles(u)
         share = q / (self.largest_pa if largest_pa is None else largest_pa)
-        share = share / np.maximum(1.0 - growth * share, _LEAST_STIFFNESS)
+        share = share / np.maximum(1.0 - growth * share, 0.1)  # of its stiffness load leaves a joint a tenth at least
         tilt = share[:, None] * (gain[:, None] * body + x[:, 7:9]) + x[:, 9:11]
         flow, bend = body + tilt, gain * share
         # mean squares and product over the window: what turns in it has no mean, but keeps the axis' angle to the flow
@@ -269,7 +265,7 @@ def reconstruct_air(
         raise GateError(
             f"air: {int(keep.sum())} windows with a deceleration above {LEAST_AXIAL_MPS2} m/s^2; "
             f"at least {_LEAST_SAMPLES} are needed to estimate density and winds",
-            code="air-not-observable",
+            code="too-few-data",
         )
     samples, drag = samples.rows(keep), drag.rows(keep)
     model = _Model(samples, profile, drag)
@@ -296,8 +292,8 @@ def _prior(
 
     The flight's unknowns are in a priori standard deviations.
     """
-    log_mach = np.log(np.maximum(mach, _LEAST_MACH))
-    time, by_mach = _knots(samples.time_s, _KNOT_S), _knots(log_mach, _KNOT_LOG_MACH)
+    log_mach = np.log(np.maximum(mach, 0.1))
+    time, by_mach = _knots(samples.time_s, _TRAJECTORY_TIME_S / 4.0), _knots(log_mach, 0.1)
     one = np.ones((len(mach), 1))
     blocks = [_interpolation(samples.altitude_m, height)] * 3
     blocks += [sd * one for sd in (drag.ca_constant_sd, drag.cn_sd, *_FLEXURE_SD)]
@@ -342,7 +338,7 @@ def _least_squares(
     edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
     measured = model.samples.specific_force_body_mps2
     sd = np.hypot(_MODEL_FLOOR_MPS2, np.array([_AXIAL_PART, _LATERAL_PART, _LATERAL_PART]) * np.abs(measured[:, :1]))
-    for _ in range(_MOST_STEPS):
+    for _ in range(20):
         local = np.column_stack([b @ x[i:j] for b, i, j in zip(blocks, edges[:-1], edges[1:], strict=True)])
         force, partials = model.linearised(local)
         residual = (measured - force) / sd
@@ -355,12 +351,12 @@ def _least_squares(
             raise GateError(
                 "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
                 "consistency checks, and check the accelerometer's axes, units and mount",
-                code="air-not-converged",
+                code="not-converged",
             ) from None
         step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
         x = x + step
         covariance = cho_solve(factor, np.eye(len(x)))
-        if np.abs(step / np.sqrt(np.diag(covariance))).max() < _CONVERGED_SD:
+        if np.abs(step / np.sqrt(np.diag(covariance))).max() < 1e-2:  # far below any error
             break
     return x, covariance, residual
 
@@ -423,14 +419,14 @@ def _drag_ratio(model: _Model) -> pd.DataFrame:
     )
 
 
-def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
+def _residual_checks(residual: FloatArray) -> list[Check]:
     """Do the forces follow the model (n, 3)?"""
     out = []
     for name, part in (("axial", residual[:, :1]), ("lateral", residual[:, 1:])):
         rms = float(np.sqrt(np.mean(part**2)))
         out.append(
-            consistency_check(
-                "force-residuals", f"air residuals {name}", rms, 0.0, _LARGEST_RMS, "forces follow the model",
+            Check.of(
+                "force-residuals", f"air residuals {name}", rms, 0.0, 2.0, "forces follow the model",
                 "forces do not follow the model", advice="check coefficients, and for forces other than aerodynamic",
                 source="air", component=name,
             )
@@ -440,7 +436,7 @@ def _residual_checks(residual: FloatArray) -> list[ConsistencyCheck]:
 
 def _consistency_checks(
     height: FloatArray, estimate: FloatArray, sd: FloatArray, ca: tuple[float, float], confidence: float
-) -> tuple[ConsistencyCheck, ...]:
+) -> tuple[Check, ...]:
     """Are density, winds and C_A (estimate and sd over its a priori sd) consistent with sounding and vehicle file?"""
     k = len(height)
     heights = [f"at {h / 1000:.0f} km" for h in height]
@@ -448,7 +444,7 @@ def _consistency_checks(
 
     def check(
         code: str, label: str, names: list[str], found: FloatArray, found_sd: FloatArray, bad: str
-    ) -> ConsistencyCheck | None:
+    ) -> Check | None:
         good = "within stated uncertainty; largest:"
         return data_sheet_check(code, label, "", names, found, np.ones(len(names)), found_sd, confidence, bad, good)
 
@@ -458,7 +454,7 @@ def _consistency_checks(
         check("sounding-density", "sounding density", names, estimate[density], sd[density], _BAD_DENSITY),
         check("sounding-wind", "sounding wind", wind, estimate[winds], sd[winds], _BAD_WIND),
         # C_N is not checked: a deflected aeroshell changes the normal force as a wrong C_N does
-        check("pre-flight-ca", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
+        check("pre-flight-drag", "pre-flight C_A", ["C_A"], np.array(ca[:1]), np.array(ca[1:]), _BAD_DRAG),
     )
     return tuple(v for v in checks if v is not None)
 
@@ -521,7 +517,7 @@ def too_sparse(bet: TrajectorySolution, window_s: float) -> GateError:
     return GateError(
         f"accelerometer and rates: no {window_s:.1f} s with samples of both at most {LARGEST_GAP_S:g} s apart "
         f"(usually {usual:.3g} s): forces at the c.g. need ten samples a second; deliver the data at their full rate",
-        code="samples-too-sparse",
+        code="too-few-data",
     )
 
 

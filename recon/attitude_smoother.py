@@ -59,16 +59,12 @@ Position = Callable[[FloatArray], FloatArray]
 _MAGNETOMETER, _HEADS = "magnetometer", "sun heads"
 _FIELD_SLOTS, _SUN_SLOTS = np.arange(12), np.array([0, 1, 4, 5, 6])  # of `recon.measurements.SLOT_NAMES`
 _FIELD_ERROR, _DRIFT = 12, 15  # where these stand among the magnetometer's terms
-_EARTHLIGHT, _AGE = slice(5, 7), 7  # and among a head's
+_AGE = 7  # and the last among a head's, after earthlight's two
 _LEAST = 1e-9  # stands for a prior of zero: a fraction, rad or s; and a ten-thousandth of it for tesla
-_DRIFT_SPACING_S = 60.0  # of knots of a magnetometer's drift: temperature changes in minutes
-_BLOCK, _BAND = 6, 12
+_BLOCK = 6
 _ROTATION, _RATE = slice(0, 3), slice(3, 6)
 _STRETCH_S = 5.0  # over which the motion is taken as equally rough: a few periods of coning or pitching
-_LEAST_DENSITY, _FIRST_DENSITY, _MOST_DENSITY = 2e-4, 0.05, 20.0  # rad/s^2 per root hertz; the least is 0.011 deg
 _RATE_PRIOR_SD = 10.0  # rad/s: no information, but a knot without neighbours stays solvable
-_MOST_DENSITY_STEPS, _MOST_STEPS = 12, 30  # bounds
-_DENSITY_CONVERGED_RAD, _CONVERGED_RAD = 5e-4, 1e-6  # 0.03 deg; rounding
 _SMALL_RAD = 1e-5  # of a numerical derivative: its square is rounding
 _EDIT_SD, _MOST_EDITED = 5.0, 0.05  # of white noise one in two million; more are no outliers
 
@@ -144,7 +140,8 @@ def error_terms(
     add(_MAGNETOMETER, "soft iron", ("xy", "xz", "yz"), "1", magnetometer.soft_iron_sd)
     add(_MAGNETOMETER, "field", AXES, "T", unstated.field_sd_t)
     first = len(rows)
-    nodes = np.linspace(start_s, end_s, max(2, int(np.ceil((end_s - start_s) / _DRIFT_SPACING_S)) + 1))
+    # temperature, and with it the magnetometer's bias, changes in minutes
+    nodes = np.linspace(start_s, end_s, max(2, int(np.ceil((end_s - start_s) / 60.0)) + 1))
     drift, time_constant_s = unstated.drift_sd_t, unstated.drift_time_constant_s
     if magnetometer.bias_wander_sd > 0.0:
         drift, time_constant_s = magnetometer.bias_wander_sd, magnetometer.bias_time_constant_s
@@ -371,7 +368,7 @@ def _sun_head(
     e[_SUN_SLOTS] = own[: len(_SUN_SLOTS)]
     up = np.einsum("rij,rj->ri", dcm_body_eci, observed.up_eci)
     below = up @ observed.dcm_body_sensor[:, 2] < -observed.edge  # the nadir is in the head's field
-    light = np.column_stack([np.ones(len(up)), below]) @ own[_EARTHLIGHT]
+    light = np.column_stack([np.ones(len(up)), below]) @ own[5:_AGE]
     body = np.einsum("rij,rj->ri", dcm_body_eci, observed.reference_eci) - light[:, None] * up
     size = np.linalg.norm(body, axis=1)
     body = unit(body)
@@ -509,7 +506,7 @@ def smooth(
     """
     turn = np.where(knots.linked[:, None], rotations.boxminus(q_eci_body[1:], q_eci_body[:-1]) / knots.step_s, 0.0)
     rate = 0.5 * (np.vstack([turn[:1], turn]) + np.vstack([turn, turn[-1:]])) if len(turn) else np.zeros((1, 3))
-    fit = Fit(q_eci_body, rate, np.zeros(terms.size), np.full((len(turn), 3), _FIRST_DENSITY))
+    fit = Fit(q_eci_body, rate, np.zeros(terms.size), np.full((len(turn), 3), 0.05))
     _iterate(fit, knots, observations, terms)
     kept = [_edited(observed, fit) for observed in observations]
     if any(len(few.knot) < len(all_.knot) for few, all_ in zip(kept, observations, strict=True)):
@@ -521,7 +518,7 @@ def _iterate(fit: Fit, knots: Knots, observations: list[VectorObservations], ter
     """Gauss-Newton steps, first with the densities estimated too, then with these kept, to convergence."""
     slope = np.zeros(terms.size)
     estimate_density = True
-    for fit.steps in range(1, _MOST_STEPS + 1):
+    for fit.steps in range(1, 31):
         linear = [linearise(observed, fit.q_eci_body, fit.rate_radps, fit.errors) for observed in observations]
         normal = _normal(fit, knots, observations, linear, terms)
         normal.error_side[:] -= slope
@@ -533,12 +530,12 @@ def _iterate(fit: Fit, knots: Knots, observations: list[VectorObservations], ter
         fit.rate_radps = fit.rate_radps + solved.knots[:, _RATE]
         fit.errors = fit.errors + solved.errors
         moved = float(np.abs(solved.knots[:, _ROTATION]).max())
-        fit.converged = not estimate_density and moved < _CONVERGED_RAD
+        fit.converged = not estimate_density and moved < 1e-6  # rad: rounding
         if fit.converged:
             break
         if estimate_density:
             _update_density(fit, knots, solved)
-            estimate_density = fit.steps < _MOST_DENSITY_STEPS and moved > _DENSITY_CONVERGED_RAD
+            estimate_density = fit.steps < 12 and moved > 5e-4  # rad: 0.03 deg
     spread = solved.carried @ solved.error_covariance
     fit.covariance = solved.own + spread @ np.swapaxes(solved.carried, 1, 2)
     fit.error_covariance = solved.error_covariance
@@ -599,7 +596,7 @@ def _solve(normal: _Normal) -> _Solved:
     from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
     n, m = len(normal.diagonal), len(normal.errors)
-    band = np.zeros((_BAND, _BLOCK * n))
+    band = np.zeros((2 * _BLOCK, _BLOCK * n))
     for i in range(_BLOCK):
         for j in range(_BLOCK):
             if i >= j:
@@ -673,7 +670,7 @@ def _update_density(fit: Fit, knots: Knots, solved: _Solved) -> None:
         # half a step at the assumed density, for stretches without information
         factor = ((total + 0.5) / (gamma + 0.5))[stretch]
         moved = fit.density[:, axis] * np.where(factor < 1.0, factor, np.sqrt(factor))
-        fit.density[:, axis] = np.clip(moved, _LEAST_DENSITY, _MOST_DENSITY)
+        fit.density[:, axis] = np.clip(moved, 2e-4, 20.0)  # the least is 0.011 deg/s^2 per root hertz
 
 
 def _misfit(

@@ -31,21 +31,20 @@ S. McReynolds, "Editing data using sequential smoothing techniques for discrete 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from flightmodel.checks import BoolArray, FloatArray, IntArray
+from flightmodel.checks import BoolArray, Check, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding
 from recon._measurement_kernels import DECELERATION, RADAR
-from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem
+from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem, jacobian
 from recon.measurements import REST, SLOT_NAMES
-from recon.settings import COMPILED, Settings
-from recon.smoother import Smoothed, backward, jacobian, two_filter
+from recon.settings import Settings
+from recon.smoother import Smoothed, smoothed_covariance
 from recon.state import KINEMATIC, States, boxminus, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
@@ -68,57 +67,8 @@ _BALLISTIC_CHECKS = {
 }
 _NAMED = 3  # failed checks in one sentence
 _MOST_OUTSIDE = 3.0  # sd beyond a physical range
-_ALIKE = 0.5  # correlation of partials from which a radar hardly separates two errors: a quarter of the variance
 SAME_STRETCH_S = 1.0  # edited measurements closer than this are one stretch
-_MOST_STRETCHES = 12  # of edited measurements that are listed one by one
 GROUPS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 9)}
-
-
-@dataclass(frozen=True)
-class ConsistencyCheck:
-    """One statistic, the band it should lie in, whether it does, and what follows.
-
-    Parameters
-    ----------
-    code : str
-        Short and stable: ``"nis"``, ``"whiteness"``, ...
-    name : str
-        The statistic and what it is of.
-    value, low, high : float
-    passed : bool
-    remark : str
-        What was found and, where the check failed, what that means and what to check.
-    source : str
-        Tracker or sensor that it is about; empty where it is about the flight.
-    component : str
-        Component or error of that source that it is about.
-    symptom : str
-        What was found, without what follows.
-    """
-
-    code: str
-    name: str
-    value: float
-    low: float
-    high: float
-    passed: bool
-    remark: str
-    source: str = ""
-    component: str = ""
-    symptom: str = ""
-
-
-def consistency_check(
-    code: str, name: str, value: float, low: float, high: float, good: str, bad: str,
-    *, advice: str = "", source: str = "", component: str = "",
-) -> ConsistencyCheck:  # fmt: skip
-    """Consistency check with the symptom that fits, ``good`` or ``bad``; ``advice`` follows where it failed."""
-    passed = bool(low <= value <= high)
-    symptom = good if passed else bad
-    remark = f"{symptom}: {advice}" if advice and not passed else symptom
-    return ConsistencyCheck(
-        code, name, float(value), float(low), float(high), passed, remark, source, component, symptom
-    )
 
 
 def doubt(failed: Sequence[str], checks: int) -> str:
@@ -141,7 +91,7 @@ def doubt(failed: Sequence[str], checks: int) -> str:
 
 def nis_check(
     source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False, measured: str = ""
-) -> ConsistencyCheck:
+) -> Check:
     """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all.
 
     With an ``allowance`` for noise, not its size, residuals may be as small as they like; else ``measured`` says what
@@ -156,30 +106,30 @@ def nis_check(
         if mean < low
         else ("larger", "noise is larger than assumed or an error is not modelled")
     )
-    return consistency_check(
+    return Check.of(
         "nis", f"NIS {source}", mean, low, high, f"residuals as large as predicted ({n} points)",
         f"residuals are {size} than predicted", advice=advice, source=source,
     )  # fmt: skip
 
 
-def whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> ConsistencyCheck:
+def whiteness_check(source: str, component: str, normalised: FloatArray, confidence: float) -> Check:
     """Lag-one autocorrelation of one component's normalised innovations (n,) against its band."""
     n = len(normalised)
     centred = normalised - normalised.mean()
     rho = float(centred[1:] @ centred[:-1] / (centred @ centred))
     band = float(ndtri(0.5 * (1.0 + confidence))) / np.sqrt(n)
-    return consistency_check(
+    return Check.of(
         "whiteness", f"whiteness {source} {component}", rho, -band, band, "successive residuals are uncorrelated",
         "successive residuals are correlated", advice="an error that lasts several points is not modelled",
         source=source, component=component,
     )  # fmt: skip
 
 
-def edit_check(source: str, accepted: BoolArray) -> ConsistencyCheck:
+def edit_check(source: str, accepted: BoolArray) -> Check:
     """Fraction of points that failed the gate."""
     count = int(np.sum(~accepted))
     symptom = f"{count} of {len(accepted)} points edited"
-    return consistency_check(
+    return Check.of(
         "edited", f"edited {source}", float(1.0 - np.mean(accepted)), 0.0, _MOST_EDITED, symptom, symptom,
         advice="it disagrees with the rest of the data, and either may be wrong", source=source,
     )  # fmt: skip
@@ -196,7 +146,7 @@ def data_sheet_check(
     confidence: float,
     bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
     good: str = "estimated sensor errors are consistent with the data sheet; largest:",
-) -> ConsistencyCheck | None:
+) -> Check | None:
     """Largest normalised shift (k,) of a priori errors of one source from zero; None where no error was observable.
 
     The remark names the ``components`` entry that moved most: ``bad`` follows its name, ``good`` goes before it.
@@ -209,7 +159,7 @@ def data_sheet_check(
     worst = str(np.array(components, dtype=object)[observable][int(np.argmax(shift))])
     name = f"{source} {worst}".strip()
     symptom, _, advice = bad.partition(": ")
-    return consistency_check(
+    return Check.of(
         code, label, float(shift.max()), 0.0, float(-ndtri(tail)), f"{good} {name}, {shift.max():.1f} sd",
         f"{name} {symptom}", advice=advice, source=source, component=worst,
     )  # fmt: skip
@@ -217,7 +167,7 @@ def data_sheet_check(
 
 def mcreynolds_checks(
     difference: FloatArray, p_filter: FloatArray, p_smoother: FloatArray, groups: list[str], confidence: float
-) -> list[ConsistencyCheck]:
+) -> list[Check]:
     """Share of filter-minus-smoother differences ``(n, 9)`` as small as their covariance says, by group."""
     most_sd = -float(ndtri(0.5 * (1.0 - _LEAST_INSIDE) * (1.0 - confidence)))
     of_filter, of_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (p_filter, p_smoother))
@@ -230,18 +180,12 @@ def mcreynolds_checks(
         use = alive[:, part]
         share = float(inside[:, part][use].mean()) if use.any() else 1.0
         out.append(
-            consistency_check(
-                "filter-smoother",
-                f"filter-smoother {name}",
-                share,
-                _LEAST_INSIDE,
-                1.0,
-                "filter and smoother differ as predicted",
-                "filter and smoother differ more than predicted",
-                advice="process noise or an error model is too small",
-                component=name,
+            Check.of(
+                "filter-smoother", f"filter-smoother {name}", share, _LEAST_INSIDE, 1.0,
+                "filter and smoother differ as predicted", "filter and smoother differ more than predicted",
+                advice="process noise or an error model is too small", component=name,
             )
-        )
+        )  # fmt: skip
     return out
 
 
@@ -251,7 +195,7 @@ def beyond_gate(held_out: pd.DataFrame, gate: float) -> pd.Series[bool]:
     return far.groupby([held_out.source, held_out.time_s], sort=False).any()
 
 
-def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[ConsistencyCheck]:
+def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Check]:
     """Whether measurements that the settings hold out are where the rest of the flight predicts them.
 
     None of trackers that the settings leave out altogether, nor of rows that a tracker's ``every_s`` leaves out where
@@ -267,7 +211,7 @@ def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings
             continue
         symptom = f"{int(far.sum())} of {len(far)} held-out points farther off than predicted"
         out.append(
-            consistency_check(
+            Check.of(
                 "held-out", f"held out {source}", float(far.mean()), 0.0, _MOST_EDITED, symptom, symptom,
                 advice="the stated noise is too small, these points are faulty, or an error is not modelled",
                 source=owner,
@@ -276,7 +220,7 @@ def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings
     return out
 
 
-def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Issue]:
     """Say which trackers, left out by the settings, are not where the others predict them: either may be wrong."""
     found = []
     owners = {instrument.name: instrument.owner for instrument in problem.instruments}
@@ -292,7 +236,7 @@ def left_out_findings(problem: Problem, held_out: pd.DataFrame, settings: Settin
             f"{abs(rows.residual[worst]) / rows.predicted_sd[worst]:.1f} sd at {rows.time_s[worst]:.1f} s: it "
             "disagrees with the trajectory, and either may be wrong"
         )
-        found.append(Finding(str(source), words, float(times.min()), float(times.max()), "left-out-disagrees"))
+        found.append(Issue(words, "left-out-disagrees", str(source), float(times.min()), float(times.max())))
     return found
 
 
@@ -302,9 +246,9 @@ def _settled_from_s(problem: Problem) -> float:
     return first + min(FIT_SPAN_S, 0.5 * (last - first))
 
 
-def source_checks(problem: Problem, innovations: Innovations, confidence: float) -> list[ConsistencyCheck]:
+def source_checks(problem: Problem, innovations: Innovations, confidence: float) -> list[Check]:
     """NIS, whiteness and edits of each source; one that was excluded by settings has none."""
-    out: list[ConsistencyCheck] = []
+    out: list[Check] = []
     time_s = problem.time_s[problem.node]
     settled = time_s > _settled_from_s(problem)
     measured = np.isfinite(problem.observed.variance)
@@ -340,7 +284,7 @@ def _measured_noise(normalised: FloatArray, measured: BoolArray, components: tup
 
 def filter_against_smoother(
     problem: Problem, run: ForwardPass, smoothed: Smoothed, reference: States, confidence: float
-) -> list[ConsistencyCheck]:
+) -> list[Check]:
     """Filter against smoother at the kept nodes after the first seconds."""
     kept = np.flatnonzero(problem.kept)
     settled = problem.time_s[kept] > _settled_from_s(problem)
@@ -351,7 +295,7 @@ def filter_against_smoother(
     return mcreynolds_checks(difference, p_filter, p_smoother, groups, confidence)
 
 
-def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[ConsistencyCheck]:
+def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) -> list[Check]:
     """One check for each instrument with errors that the flight made observable."""
     out = []
     owners = np.array(problem.model.instruments, dtype=object)
@@ -368,7 +312,7 @@ def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) 
 
 def physical_checks(
     problem: Problem, innovations: Innovations, table: pd.DataFrame, radars: Iterable[str]
-) -> list[ConsistencyCheck]:
+) -> list[Check]:
     """One check for each estimated error of the radars that cannot have every size; a failed one names look-alikes."""
     out = []
     rows = table.set_index("name")
@@ -388,7 +332,7 @@ def physical_checks(
                 f"its readings look alike with {', '.join(alike)}: state these" if alike else "check its correction"
             )
             out.append(
-                consistency_check(
+                Check.of(
                     "physical-range", f"physical range {name}", outside, 0.0, _MOST_OUTSIDE,
                     f"{found} is possible", f"{found} is outside {low:g} to {high:g}",
                     advice=f"{advice}, or the range's correction took out more than there was",
@@ -411,10 +355,11 @@ def _look_alikes(problem: Problem, innovations: Innovations, number: int, compon
         size = np.linalg.norm(columns[:, k]) * np.linalg.norm(mine)
         if k not in biases and name != component and "survey" not in name and size > 0.0:
             alike[name] = abs(float(columns[:, k] @ mine)) / size
-    return sorted((name for name, c in alike.items() if c > _ALIKE), key=lambda name: -alike[name])
+    # from a quarter of the variance on a radar hardly separates two errors
+    return sorted((name for name, c in alike.items() if c > 0.5), key=lambda name: -alike[name])
 
 
-def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -> pd.DataFrame:
+def held_out_table(problem: Problem, run: ForwardPass) -> pd.DataFrame:
     """One row for each component of the measurements that were not used: `_COLUMNS`, in order of time."""
     rows = _chosen(problem)
     if len(rows) == 0:
@@ -423,7 +368,7 @@ def held_out_table(problem: Problem, run: ForwardPass, engine: str = COMPILED) -
     wanted = np.unique(node[rows])
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[wanted] = True
-    x, covariance = smoothed_covariance(problem, run, kept, engine)
+    x, covariance = smoothed_covariance(problem, run, kept)
     slots = problem.sources().slot
     out = []
     for row in rows.tolist():
@@ -465,31 +410,6 @@ def _chosen(problem: Problem) -> IntArray:
     return np.asarray(rows, dtype=np.int64)
 
 
-def smoothed_covariance(
-    problem: Problem, run: ForwardPass, kept: BoolArray, engine: str
-) -> tuple[FloatArray, FloatArray]:
-    """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
-    rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
-    rows[kept] = np.arange(int(kept.sum()))
-    filtered = run.filtered._replace(kept=rows)
-    triangles = np.empty((int(kept.sum()), problem.size * (problem.size + 1) // 2))
-    variance = np.empty((len(triangles), problem.size))
-    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
-    if len(considered):
-        x = run.filtered.x_minus.copy()
-        two_filter(
-            run.steps, filtered, problem.observed, problem.sources().slot, run.innovations, considered, x, triangles,
-            variance,
-        )  # fmt: skip
-        return x, unpacked(triangles)
-    phi = run.steps.transition
-    # the smoother keeps the covariance of errors that the motion depends on: of all, where all are columns
-    wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
-    x = run.filtered.x_plus.copy()
-    backward(engine)(run.steps._replace(transition=wide), filtered, problem.moving, x, triangles, variance)
-    return x, unpacked(triangles)
-
-
 def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     """One row for each component that was measured; what is not ``used`` is held out."""
     row, component = np.nonzero(np.isfinite(problem.observed.variance))
@@ -509,12 +429,12 @@ def residual_table(problem: Problem, innovations: Innovations) -> pd.DataFrame:
     )
 
 
-def point_findings(problem: Problem, accepted: BoolArray, held_out: pd.DataFrame, settings: Settings) -> list[Finding]:
+def point_findings(problem: Problem, accepted: BoolArray, held_out: pd.DataFrame, settings: Settings) -> list[Issue]:
     """Findings on measurements that were edited, and on trackers that are left out."""
     return edit_findings(problem, accepted) + left_out_findings(problem, held_out, settings)
 
 
-def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
+def edit_findings(problem: Problem, accepted: BoolArray) -> list[Issue]:
     """Stretches in which measurements were edited; sources excluded by settings have none."""
     out = []
     time_s = problem.time_s[problem.node]
@@ -525,12 +445,12 @@ def edit_findings(problem: Problem, accepted: BoolArray) -> list[Finding]:
             continue
         what = "track point" if instrument.name == instrument.owner else "reading"
         stretches = np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1)
-        if len(stretches) > _MOST_STRETCHES:
+        if len(stretches) > 12:
             share = 100.0 * len(times) / int(mine.sum())
             remark = f"{len(times)} {what}s edited in {len(stretches)} stretches ({share:.0f} % of them)"
-            out.append(Finding(instrument.name, remark, float(times[0]), float(times[-1]), "points-edited"))
+            out.append(Issue(remark, "points-edited", instrument.name, float(times[0]), float(times[-1])))
             continue
         for stretch in stretches:
             remark = f"{len(stretch)} {what}{'s' if len(stretch) > 1 else ''} edited"
-            out.append(Finding(instrument.name, remark, float(stretch[0]), float(stretch[-1]), "points-edited"))
+            out.append(Issue(remark, "points-edited", instrument.name, float(stretch[0]), float(stretch[-1])))
     return out

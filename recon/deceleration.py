@@ -10,11 +10,10 @@ import numpy as np
 from scipy.special import ndtri
 
 from flightmodel import earth
-from flightmodel.checks import FloatArray
+from flightmodel.checks import Check, FloatArray
 from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Telemetry
 from recon._measurement_kernels import DECELERATION
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Problem
 from recon.state import States
 
@@ -22,14 +21,10 @@ _LEAST_QUIET = 20  # readings: a second of them
 _MOST_FELT = 3.0  # beyond it the drag hides a bias that the check should show
 _CLEARLY_FELT = 50.0  # times its noise: steps of a twentieth are then clear
 _NEIGHBOURS = 5  # readings before and after a step: a quarter of a second at the rate of block means
-_GAP_STEPS = 2.5
 _OVERTURNING = 2.0 / 7.0  # (gamma - 1) / gamma of a gas of two atoms; carbon dioxide has 0.25
-_STRONG = 0.95  # quantile of readings that is a peak, beside wild ones
 
 
-def deceleration_checks(
-    telemetry: Telemetry, problem: Problem, run: ForwardPass, confidence: float
-) -> list[ConsistencyCheck]:
+def deceleration_checks(telemetry: Telemetry, problem: Problem, run: ForwardPass, confidence: float) -> list[Check]:
     """Every check of an accelerometer that the drag follows; none of another flight."""
     trim_sd_rad = telemetry.motion.trim_sd_rad
     return [
@@ -39,7 +34,7 @@ def deceleration_checks(
     ]
 
 
-def lateral_checks(telemetry: Telemetry, confidence: float) -> list[ConsistencyCheck]:
+def lateral_checks(telemetry: Telemetry, confidence: float) -> list[Check]:
     """Whether forces across the axis are as small as the stated trim lets them be, where they are measured.
 
     Their rms over the strongest readings, over the axial mean, is the tangent of the angle between body x and the
@@ -52,7 +47,7 @@ def lateral_checks(telemetry: Telemetry, confidence: float) -> list[ConsistencyC
     spec = record.spec
     force = record.measured_sensor[np.isfinite(record.measured_sensor).all(axis=1)] @ spec.dcm_body_sensor.T
     axial = np.abs(force[:, 0])
-    strong = axial > 0.5 * np.quantile(axial, _STRONG)
+    strong = axial > 0.5 * np.quantile(axial, 0.95)  # which is a peak, beside wild readings
     mean = float(axial[strong].mean())
     if strong.sum() < _LEAST_QUIET or mean < _CLEARLY_FELT * max(spec.noise_sd, spec.bias_sd):
         return []
@@ -63,7 +58,7 @@ def lateral_checks(telemetry: Telemetry, confidence: float) -> list[ConsistencyC
     # normal in both directions across: Rayleigh's distribution
     most = float(np.sqrt(-2.0 * np.log(1.0 - confidence)))
     return [
-        consistency_check(
+        Check.of(
             "lateral-reading", f"lateral reading {spec.name}", across / sd, 0.0, most,
             f"{found}, as trim allows", found,
             advice="its axes are not the body's (state axes), or the vehicle flies at an angle: state trim_sd_deg, and "
@@ -73,7 +68,7 @@ def lateral_checks(telemetry: Telemetry, confidence: float) -> list[ConsistencyC
     ]  # fmt: skip
 
 
-def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list[ConsistencyCheck]:
+def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list[Check]:
     """Whether an accelerometer that the drag follows reads its bias, as stated, before the air is felt.
 
     Of a bias that is only considered, without a tracker, nothing else shows that it is larger: the drag takes it. Air
@@ -96,7 +91,7 @@ def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list
         beyond = max(mean - drag, -mean, 0.0) / sd
         found = f"before the air is felt it reads {-mean:+.2g} m/s2, {beyond:.1f} sd of its bias beyond the drag there"
         out.append(
-            consistency_check(
+            Check.of(
                 "vacuum-reading", f"vacuum reading {instrument.owner}", beyond, 0.0,
                 float(-ndtri(0.5 * (1.0 - confidence))), found, found,
                 advice="take this mean from all readings, state a larger bias_sd, or check t_s and the unit",
@@ -106,9 +101,7 @@ def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list
     return out
 
 
-def reading_jump_checks(
-    problem: Problem, run: ForwardPass, trim_sd_rad: float, confidence: float
-) -> list[ConsistencyCheck]:
+def reading_jump_checks(problem: Problem, run: ForwardPass, trim_sd_rad: float, confidence: float) -> list[Check]:
     """Whether a deceleration jumps from one reading to the next, as where rows are missing whose times were closed up.
 
     From reading to reading density follows the height, and what that may differ from the neighbours' course is limited:
@@ -142,14 +135,14 @@ def reading_jump_checks(
         swing = np.sin(min(most * trim_sd_rad, 0.5 * np.pi)) ** 2 / most
         sd = np.sqrt((_OVERTURNING * np.diff(air)[k]) ** 2 + swing**2 + 2.0 * noise[k] ** 2 + scatter**2)
         gap = np.lib.stride_tricks.sliding_window_view(np.diff(time_s), 2 * _NEIGHBOURS - 1).max(axis=1)
-        whole = gap < _GAP_STEPS * np.median(np.diff(time_s))
+        whole = gap < 2.5 * np.median(np.diff(time_s))
         away = np.where(whole, jump / sd, 0.0)
         worst = int(np.argmax(away))
         when = f"from {time_s[k[worst]]:.2f} to {time_s[k[worst] + 1]:.2f} s"
         percent = 100.0 * np.expm1(own[worst])
         found = f"the deceleration changes by {percent:+.0f} % {when} beside its neighbours' course"
         out.append(
-            consistency_check(
+            Check.of(
                 "reading-jump", f"reading jump {instrument.owner}", float(away[worst]), 0.0,
                 most, f"{found}, as air may", found,
                 advice="rows are missing and their times were closed up, a clock was set, the range was switched, or a "

@@ -17,9 +17,9 @@ A pass is plain tuples of arrays, which both engines take: ``n`` nodes, ``M`` me
 kinematic ones (``N = 9 + m``), the first ``s`` of them drivers of the motion (`recon.propagation`), ``D = 9 + s``.
 Symmetric matrices are stored as packed lower triangles. A `Problem` is all that a pass is given.
 
-Engines: ``"compiled"`` (the default, `recon._filter_kernels`) and ``"filterpy"``, filterpy's `ExtendedKalmanFilter`
-with sensor models in numpy, which is also where another filter can be put in its place. Both step the nominal state by
-the same compiled mechanisation. Measured speeds: docs/decisions/0007-two-engines.md.
+Engines: ``"compiled"`` (the default, `recon._filter_kernels`) and ``"filterpy"``, the forward pass by filterpy's
+`ExtendedKalmanFilter`, in whose place another filter can be put. Both take steps and measurements as the same compiled
+kernels linearise them. Measured speeds: docs/decisions/0007-two-engines.md.
 
 References
 ----------
@@ -36,14 +36,13 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray, IntArray
-from flightmodel.earth import WGS84, Planet
 from flightmodel.trajectory import nearest_index
-from recon import _filter_kernels, _measurement_kernels
+from recon import _filter_kernels
 from recon._measurement_kernels import RADAR, SLOTS
-from recon.measurements import Instrument, NodeMotion, predict, servo_lag, wrapped
-from recon.propagation import SAME_INSTANT_S, Motion, propagate
+from recon.measurements import Instrument, servo_lag, wrapped
+from recon.propagation import SAME_INSTANT_S, Motion
 from recon.settings import COMPILED
-from recon.state import KINEMATIC, ROTATION, ErrorModel, States, boxminus, boxplus, packed, right_jacobian
+from recon.state import KINEMATIC, ErrorModel, States, boxminus, boxplus, packed
 
 FIT_SPAN_S = 3.0  # of the track points that the start is fitted to
 
@@ -145,9 +144,6 @@ class Innovations(NamedTuple):
     gain: FloatArray
     by_state: FloatArray
     by_error: FloatArray
-
-
-_LEAST_NODES = 4  # of a path that servos follow
 
 
 @dataclass(frozen=True)
@@ -266,7 +262,7 @@ class Problem:
 def with_servo_lag(problem: Problem, states: States | None) -> Problem:
     """Problem whose radars lag behind a path through all its nodes; as it is without servos, or a path."""
     lagging = [k for k, one in enumerate(problem.instruments) if one.kind == RADAR and one.servo_hz > 0.0]
-    if states is None or not lagging or len(problem.time_s) < _LEAST_NODES:
+    if states is None or not lagging or len(problem.time_s) < 4:
         return problem
     known, at_s = problem.observed.known.copy(), problem.time_s[problem.node]
     for number in lagging:
@@ -334,7 +330,7 @@ def forward(problem: Problem, reference: States | None = None, engine: str = COM
             problem.gate, reference is not None, start, steps, charts, run, innovations,
         )  # fmt: skip
     else:
-        _FilterpyPass(problem, reference is not None, start, steps, charts, run, innovations).run_all()
+        _forward_by_filterpy(problem, reference is not None, start, steps, charts, run, innovations)
     states = States(charts.position, charts.velocity, rotations.continuous(charts.q), charts.errors)
     return ForwardPass(states, steps, run, innovations)
 
@@ -366,114 +362,81 @@ def empty_pass(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
     return steps, run, innovations
 
 
-class _FilterpyPass:
-    """One forward pass on filterpy's `ExtendedKalmanFilter`."""
+def _forward_by_filterpy(
+    problem: Problem,
+    follow: bool,
+    start: FloatArray,
+    steps: Steps,
+    charts: Charts,
+    run: Filtered,
+    innovations: Innovations,
+) -> None:
+    """As `recon._filter_kernels.forward`, with filterpy's algebra on the same linearised steps and measurements."""
+    ekf, observed, sources = make_filter(problem.size, start, run.p_last), problem.observed, problem.sources()
+    considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
+    for k in range(len(problem.time_s)):
+        if k > 0:
+            x, scratch = ekf.x.copy(), np.empty(problem.size)
+            _filter_kernels.advance(
+                problem.motion, problem.node_index, problem.model.wander, follow, steps, charts, x, scratch, k
+            )
+            ekf.F, ekf.Q = full_step(steps, k - 1)
+            ekf.predict(u=x - ekf.F @ ekf.x)
+        run.x_minus[k], run.p_minus[k] = ekf.x, packed(ekf.P)
+        for row in range(observed.first[k], observed.first[k + 1]):
+            prediction, by = np.empty(3), (innovations.by_state[row], innovations.by_error[row])
+            _filter_kernels.predict_one(
+                problem.motion, problem.node_index[k], sources, observed, charts, k, row, prediction, *by
+            )
+            off_chart = wrapped(sources.kind[observed.source[row]], observed.value[row] - prediction)
+            used, h = measured_rows(observed, sources.slot, innovations, row, problem.size)
+            _use(ekf, problem, innovations, row, used, off_chart[used], h, considered)
+        run.x_plus[k] = ekf.x
+        if run.kept[k] >= 0:
+            run.p_plus[run.kept[k]] = packed(ekf.P[: problem.dense, : problem.dense])
+    run.p_last[:] = ekf.P
 
-    def __init__(
-        self,
-        problem: Problem,
-        follow: bool,
-        start: FloatArray,
-        steps: Steps,
-        charts: Charts,
-        run: Filtered,
-        innovations: Innovations,
-    ) -> None:
-        self.problem, self.follow = problem, follow
-        self.steps, self.charts, self.run, self.innovations = steps, charts, run, innovations
-        self.ekf = make_filter(problem.size, start, run.p_last.copy())
-        self.wander = problem.model.wander
-        self.considered = KINEMATIC + np.flatnonzero(self.wander.considered)
-        self.slots = [i.slots(problem.model) for i in problem.instruments]
 
-    def run_all(self) -> None:
-        """All nodes in turn."""
-        for k in range(len(self.problem.time_s)):
-            if k > 0:
-                self.predict(k)
-            self.run.x_minus[k], self.run.p_minus[k] = self.ekf.x, packed(self.ekf.P)
-            for row in range(self.problem.observed.first[k], self.problem.observed.first[k + 1]):
-                self.update(k, row)
-            self.run.x_plus[k] = self.ekf.x
-            if self.run.kept[k] >= 0:
-                dense = self.problem.dense
-                self.run.p_plus[self.run.kept[k]] = packed(self.ekf.P[:dense, :dense])
-        self.run.p_last[:] = self.ekf.P
+def _use(
+    ekf: Any, problem: Problem, innovations: Innovations, row: int,
+    used: IntArray, off_chart: FloatArray, h: FloatArray, considered: IntArray,
+) -> None:  # fmt: skip
+    """Use the components (k,) of one measurement if they pass the gate."""
+    noise = np.diag(problem.observed.variance[row, used])
+    y, s = off_chart - h @ ekf.x, h @ ekf.P @ h.T + noise
+    innovations.residual[row], innovations.covariance[row] = 0.0, np.eye(3)
+    innovations.residual[row, used], innovations.covariance[row][np.ix_(used, used)] = y, s
+    innovations.nis[row] = y @ np.linalg.solve(s, y)
+    innovations.accepted[row] = innovations.nis[row] <= problem.gate[len(used)] and problem.observed.usable[row]
+    if innovations.accepted[row]:
+        innovations.gain[row][:, used] = schmidt_update(ekf, y, h, noise, considered)
 
-    def chart(self, k: int) -> States:
-        """Nominal state of a node."""
-        return States(*(part[k] for part in self.charts))
 
-    def predict(self, k: int) -> None:
-        """From node ``k - 1`` to node ``k``."""
-        problem, ekf, j = self.problem, self.ekf, k - 1
-        estimate = self.chart(j) if self.follow else boxplus(self.chart(j), ekf.x)
-        step = propagate(problem.motion, problem.node_index[j], problem.node_index[k], estimate)
-        phi = step.transition
-        if not self.follow:
-            phi[:, ROTATION] = phi[:, ROTATION] @ right_jacobian(ekf.x[ROTATION])
-        planet = problem.motion.planet
-        climb = abs(height(step.state, planet) - height(estimate, planet))
-        decay, noise_var = self._decay(problem.time_s[k] - problem.time_s[j], climb)
-        reached = States(*as_charts(step.state)[:3], step.state.sensor_errors * decay)
-        self.steps.transition[j], self.steps.noise[j] = phi, step.noise
-        self.steps.decay[j], self.steps.noise_var[j] = decay, noise_var
+def full_step(steps: Steps, k: int) -> tuple[FloatArray, FloatArray]:
+    """Whole transition and noise (N, N) of a step from its blocks."""
+    decay, noise_var = steps.decay[k], steps.noise_var[k]
+    f = np.diag(np.concatenate([np.ones(KINEMATIC), decay]))
+    q = np.diag(np.concatenate([np.zeros(KINEMATIC), noise_var]))
+    phi = steps.transition[k]
+    f[:KINEMATIC, : phi.shape[1]] = phi
+    q[:KINEMATIC, :KINEMATIC] = steps.noise[k]
+    return f, q
 
-        ekf.F = np.diag(np.concatenate([np.ones(KINEMATIC), decay]))
-        ekf.F[:KINEMATIC, : problem.dense] = phi
-        ekf.Q = np.diag(np.concatenate([np.zeros(KINEMATIC), noise_var]))
-        ekf.Q[:KINEMATIC, :KINEMATIC] = step.noise
-        if self.follow:
-            ekf.predict(u=boxminus(reached, self.chart(k)))
-            return
-        for part, value in zip(self.charts, as_charts(reached), strict=True):
-            part[k] = value
-        ekf.predict(u=-(ekf.F @ ekf.x))
 
-    def _decay(self, dt_s: float, climb_m: float) -> tuple[FloatArray, FloatArray]:
-        """Decay of each error over a step, and the variance that comes new."""
-        w = self.wander
-        decay = np.maximum(_filter_kernels.LEAST_DECAY, np.exp(-dt_s / w.time_constant_s - climb_m / w.altitude_m))
-        stays = np.isinf(w.time_constant_s) & np.isinf(w.altitude_m)
-        return decay, np.where(stays, w.walk_var_per_s * dt_s, w.sd**2 * (1.0 - decay**2))
+def jacobian(innovations: Innovations, slot: IntArray, row: int, size: int) -> FloatArray:
+    """Partials (3, N) of one measurement's prediction by all errors; ``slot`` (SLOTS,) of its instrument."""
+    h = np.zeros((3, size))
+    h[:, :KINEMATIC] = innovations.by_state[row]
+    h[:, KINEMATIC + slot[slot >= 0]] += innovations.by_error[row][:, slot >= 0]
+    return h
 
-    def node_motion(self, k: int) -> NodeMotion:
-        """Motion of a node, as measurements are predicted from it."""
-        chart = self.chart(k)
-        rate, acceleration = np.empty((12, 3)), np.empty(3)
-        _measurement_kernels.motion_at(
-            self.problem.motion, self.problem.node_index[k], *as_charts(chart), rate, acceleration
-        )
-        c = rotations.dcm_from_q(chart.q_ecef_body)
-        place = chart.position_ecef_m, chart.velocity_ecef_mps
-        return NodeMotion(*place, c, rate, acceleration, self.problem.motion)
 
-    def update(self, k: int, row: int) -> None:
-        """Use one measurement if it passes the gate."""
-        ekf, observed = self.ekf, self.problem.observed
-        source = observed.source[row]
-        instrument, slot = self.problem.instruments[source], self.slots[source]
-        there = slot >= 0
-        e = np.where(there, self.charts.errors[k][slot], 0.0)
-        h, by_state, by_error = predict(instrument, observed.known[row], e, self.node_motion(k))
-        jacobian = np.zeros((3, self.problem.size))
-        jacobian[:, :KINEMATIC] = by_state
-        jacobian[:, KINEMATIC + slot[there]] += by_error[:, there]
-        used = np.flatnonzero(np.isfinite(observed.variance[row]))
-        jacobian, noise = jacobian[used], np.diag(observed.variance[row, used])
-        y = wrapped(instrument.kind, observed.value[row] - h)[used] - jacobian @ ekf.x
-        s = jacobian @ ekf.P @ jacobian.T + noise
-        nis = float(y @ np.linalg.solve(s, y))
-        accepted = bool(nis <= self.problem.gate[len(used)] and observed.usable[row])
-
-        out, both = self.innovations, np.ix_(used, used)
-        out.residual[row], out.covariance[row] = 0.0, np.eye(3)
-        out.residual[row, used], out.covariance[row][both] = y, s
-        out.nis[row], out.accepted[row] = nis, accepted
-        out.by_state[row], out.by_error[row] = by_state, by_error
-        if accepted:
-            gain = schmidt_update(ekf, y, jacobian, noise, self.considered)
-            out.gain[row][:, used] = gain
+def measured_rows(
+    observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
+) -> tuple[IntArray, FloatArray]:
+    """Components (k,) that a measurement has, and their partials by all errors (k, N)."""
+    used = np.flatnonzero(np.isfinite(observed.variance[row]))
+    return used, jacobian(innovations, slots[observed.source[row]], row, size)[used]
 
 
 def make_filter(size: int, x: FloatArray, p: FloatArray) -> Any:
@@ -505,8 +468,3 @@ def schmidt_update(
     p = rest @ ekf.P @ rest.T + gain @ noise @ gain.T
     ekf.P = 0.5 * (p + p.T)
     return np.asarray(gain)
-
-
-def height(state: States, planet: Planet = WGS84) -> float:
-    """Geodetic height of one state, m."""
-    return float(_filter_kernels.height(state.position_ecef_m, planet))

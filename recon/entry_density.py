@@ -45,10 +45,9 @@ from flightmodel.atmosphere import (
     sound_speed,
     standard_air,
 )
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem
 from recon.propagation import Motion
 from recon.state import KINEMATIC, States, unpacked
@@ -58,7 +57,6 @@ LEAST_KNOWN = 0.5  # fractional sd of density, C_A apart, from which a row is gi
 _LEAST_FELT = 0.2
 _HALF_WINDOW_S = 0.25  # of an axial reading
 _INDEPENDENT_M = 2.0 * DENSITY_LENGTH_M  # thickness of layers in which the stated density errs each by itself
-_APART_S, _NOISE_SPAN_S = 2, 11  # a parachute inflates within a second or two; over a few seconds noise is the same
 _WAVES = 0.14  # of density over a kilometre or two: waves of 20 K in 140 K, assumed
 _SWING = 0.005  # of an axial force, while the vehicle swings by 4 deg; in level flight nothing else changes
 _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a fortieth of Mars's scale height
@@ -158,13 +156,13 @@ def density_by_drag(telemetry: Telemetry, path: Trajectory, history: DragHistory
     Raises
     ------
     GateError
-        ``drag-missing`` where flight.toml states no drag, ``deceleration-missing`` where nothing measures it.
+        ``drag-missing`` where flight.toml states no drag, ``input-missing`` where nothing measures it.
     """
     drag = telemetry.drag
     if drag is None:
         raise GateError("density as flown: state [drag] (c_a, area, mass) or a vehicle in flight.toml", "drag-missing")
     if history is None:
-        raise GateError("density as flown: no accelerometer and no ballistic motion", "deceleration-missing")
+        raise GateError("density as flown: no accelerometer and no ballistic motion", "input-missing")
     profile = profile_from_sounding(telemetry.sounding)
     air = air_data(path, profile, np.zeros(3))
     rho = np.exp(history.log_drag) / drag.area_per_mass_m2pkg(air.mach)
@@ -244,7 +242,7 @@ def _mean(
     return weight * flown + (1.0 - weight) * stated, np.sqrt(1.0 - weight) * stated_sd
 
 
-def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check the density by the drag against the stated atmosphere, by the error of both and of the height.
 
     With neither tracker nor gyros this alone shows a radius for a diameter or a height that is 20 km off.
@@ -259,7 +257,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None of an empty table.
     """
     if table.empty:
@@ -275,7 +273,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
     sd = np.sqrt(sum(part**2 for part in parts))
     layer = _worst_layer(height, np.log(table["density_ratio"]).to_numpy(), np.asarray(sd), confidence)
     found = f"density at {layer.between} is {np.exp(layer.mean):.2g} times the stated atmosphere's"
-    return consistency_check(
+    return Check.of(
         "sounding-density", "sounding density", layer.away, 0.0, layer.most, f"{found}, within what both may err",
         found,
         advice="the air differed, or mass, area or C_A of [drag], height or speed of the stated state, or the "
@@ -283,7 +281,7 @@ def density_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: fl
     )  # fmt: skip
 
 
-def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check the temperature by the weight of the air above against the stated one, by the errors of both.
 
     It is of another kind than density: a factor of the drag is not in it, but a deceleration that is too small, or rows
@@ -300,7 +298,7 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None of an empty table.
     """
     if table.empty:
@@ -314,7 +312,7 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
     sd = np.hypot(own * usual, stated.temperature_sd(height))
     layer = _worst_layer(height, (flown - usual).to_numpy(), np.asarray(sd), confidence)
     found = f"temperature by the drag at {layer.between} is {layer.mean:+.0f} K from the stated atmosphere's"
-    return consistency_check(
+    return Check.of(
         "sounding-temperature", "sounding temperature", layer.away, 0.0, layer.most,
         f"{found}, within what both may err", found,
         advice="scale or axis of the accelerometer, rows that are missing with their time, axes, angles and speed of "
@@ -348,7 +346,7 @@ def _worst_layer(height_m: FloatArray, off: FloatArray, sd: FloatArray, confiden
     return _Layer(float(layers["off"].iloc[worst]), float(shift[worst]), float(most[worst]), between)
 
 
-def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> ConsistencyCheck | None:
+def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: float) -> Check | None:
     """Check that the density by the drag does not jump, as where a parachute opens or a part separates.
 
     Means over a second are compared with those two seconds before, or before a gap, since the filter rejects the first
@@ -366,7 +364,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
 
     Returns
     -------
-    ConsistencyCheck or None
+    Check or None
         None where no two means are two seconds apart or more.
     """
     log_ratio = np.log(table["density_ratio"])
@@ -376,9 +374,10 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     whole = rows.groupby(np.floor(table["time_s"]).astype(int)).agg(
         {"log_ratio": "mean", "height": "mean", "noise": "mean", "count": "sum"}
     )
-    noise = whole["noise"].rolling(_NOISE_SPAN_S, center=True, min_periods=1).mean() / whole["count"]
+    # over a few seconds noise is the same, and a parachute inflates within a second or two
+    noise = whole["noise"].rolling(11, center=True, min_periods=1).mean() / whole["count"]
     second = whole.index.to_numpy()
-    at = np.searchsorted(second, second - _APART_S, side="right") - 1
+    at = np.searchsorted(second, second - 2, side="right") - 1
     last = np.flatnonzero(at >= 0)
     if not len(last):
         return None
@@ -392,7 +391,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
     worst = int(np.argmax(np.abs(jump)))
     when = f"from {before.index[worst]} to {after.index[worst]} s"
     found = f"{np.exp(change[worst]):.2g} times the stated atmosphere's change {when}"
-    return consistency_check(
+    return Check.of(
         "drag-jump", "density by the drag does not jump", float(np.abs(jump[worst])), 0.0,
         float(-ndtri(0.5 * (1.0 - confidence) / len(last))), f"{found}, as air may", found,
         advice="a parachute opened, a part separated or the reading jumped: leave out what follows by use_s, or state "

@@ -43,10 +43,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, IntArray
-from flightmodel.telemetry import Finding
+from flightmodel.checks import Check, DivergenceError, FloatArray, IntArray, Issue
 from recon import _glr_kernels
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Innovations, Problem
 from recon.imu_screening import TransientOffset
 
@@ -57,7 +55,6 @@ UNMODELLED_CODE = "unmodelled-acceleration"
 _REJECTED_S = 5.0  # no point accepted for so long in ballistic flight, or, in any, to the end of the track
 LEAST_REJECTED_POINTS = 6  # sound points are edited so seldom that six in a row have another cause
 _LEAST_ACCEPTED_SHARE = 0.5  # with fewer, the filter follows the minority
-_BEFORE_S, _AFTER_S = 1.5, 0.5  # a slow departure passes the gate for a while
 _FIRST_DENSITY, _GROWTH, _LARGEST_DENSITY = 0.1, 10.0, 1.1e6  # (m/s^2)^2/Hz
 MOST_SPANS = 10  # in which inertial sensors may fail to carry the track before the flight is refused
 
@@ -121,20 +118,20 @@ class UnmodelledAcceleration:
     end_s: float
     density: float
 
-    def finding(self) -> Finding:
+    def finding(self) -> Issue:
         """Finding that names its size."""
         gained = np.sqrt(self.density * (self.end_s - self.start_s))
         remark = (
             f"unmodelled acceleration: about {gained:.2g} m/s of velocity along each axis that neither sensors nor the "
             "motion model explain; check for staging, thrust, a parachute or a saturated sensor"
         )
-        return Finding("motion", remark, self.start_s, self.end_s, UNMODELLED_CODE)
+        return Issue(remark, UNMODELLED_CODE, "motion", self.start_s, self.end_s)
 
 
-def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> ConsistencyCheck:
+def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> Check:
     """Whether accelerometer and gyros carry the track without any acceleration that they did not measure."""
     where = ", ".join(f"{d.start_s:.1f} to {d.end_s:.1f} s" for d in spans)
-    return consistency_check(
+    return Check.of(
         UNMODELLED_CODE, "sensors carry the track", len(spans), 0.0, 0.0, "accelerometer and gyros carry the track",
         f"an acceleration that they did not measure is needed to follow the track ({where})",
         advice="trackers that lag (time tags, a receiver beyond its dynamics), or sensors that saturate: correct or "
@@ -181,7 +178,8 @@ def with_one_more(
     lost = _rejected_span(problem, run.innovations)
     if lost is None:
         return None
-    start, end = max(lost[0] - _BEFORE_S, float(problem.time_s[0])), lost[1] + _AFTER_S
+    # a slow departure passes the gate for a while
+    start, end = max(lost[0] - 1.5, float(problem.time_s[0])), lost[1] + 0.5
     near = [d for d in known if d.start_s <= end and start <= d.end_s]
     density = max((d.density for d in near), default=_FIRST_DENSITY / _GROWTH) * _GROWTH
     if density > _LARGEST_DENSITY:

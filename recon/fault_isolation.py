@@ -33,11 +33,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, Issue
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
-from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, ConsistencyCheck, beyond_gate, edit_check
+from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, beyond_gate, edit_check
 from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
@@ -52,7 +52,7 @@ _ABOUT_SOURCES = ("nis", "whiteness", "edited", "held-out", "data-sheet")  # cod
 # of checks of the air; the drag shows density times C_A times area over mass: what is off may be in either file
 _AIR_SOURCES = {
     **dict.fromkeys(("sounding", "sounding-density"), ("atmosphere", "vehicle")),
-    **dict.fromkeys(("pre-flight-drag", "pre-flight-ca"), ("vehicle", "atmosphere")),
+    "pre-flight-drag": ("vehicle", "atmosphere"),
     **dict.fromkeys(("sounding-temperature", "drag-jump", "sounding-wind"), ("atmosphere",)),
     "force-residuals": ("air",),
 }
@@ -70,7 +70,7 @@ class LeftOut:
     Parameters
     ----------
     source : str
-    failed : tuple of ConsistencyCheck or None
+    failed : tuple of Check or None
         None where no trajectory can be made without it.
     distance_m : float
         Largest distance from the solution with all sources.
@@ -83,7 +83,7 @@ class LeftOut:
     """
 
     source: str
-    failed: tuple[ConsistencyCheck, ...] | None
+    failed: tuple[Check, ...] | None
     distance_m: float = 0.0
     inconsistent: bool = False
     start_s: float = float("nan")
@@ -130,33 +130,20 @@ class Adaptation:
 NO_ADAPTATION = Adaptation()
 
 
-class FaultHypothesis(Fault):
-    """One sentence about what is most likely wrong, with a stable code and the sources it names."""
-
-    sources: tuple[str, ...]
-
-    def __new__(cls, words: str, code: str = "", sources: tuple[str, ...] = ()) -> FaultHypothesis:
-        """Keep code and sources beside the sentence."""
-        made = super().__new__(cls, words, code)
-        assert isinstance(made, cls)
-        made.sources = sources
-        return made
-
-
 # ---- leave-one-out comparison of trackers
 
 
-def is_about(check: ConsistencyCheck, source: str) -> bool:
+def is_about(check: Check, source: str) -> bool:
     """Whether a check judges this tracker: its residuals, its edits or its a priori errors."""
     return check.code in _ABOUT_SOURCES and check.source == source and not is_generous(check)
 
 
-def is_generous(check: ConsistencyCheck) -> bool:
+def is_generous(check: Check) -> bool:
     """Whether residuals are smaller than predicted: the stated noise is too large, and no sensor is at fault."""
     return check.code == "nis" and check.value < check.low
 
 
-def any_tracker_fails(checks: tuple[ConsistencyCheck, ...], sources: tuple[str, ...]) -> bool:
+def any_tracker_fails(checks: tuple[Check, ...], sources: tuple[str, ...]) -> bool:
     """Whether any failed check is about a tracker."""
     return any(not v.passed and is_about(v, s) for v in checks for s in sources)
 
@@ -164,7 +151,7 @@ def any_tracker_fails(checks: tuple[ConsistencyCheck, ...], sources: tuple[str, 
 def leave_one_out(
     smoothed: Trajectory,
     sources: tuple[str, ...],
-    rerun: Callable[[str], tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]],
+    rerun: Callable[[str], tuple[Trajectory, tuple[Check, ...], bool]],
 ) -> tuple[tuple[LeftOut, ...], FloatArray]:
     """Result without each source, and what to add to the covariance, (n, 9, 9).
 
@@ -227,19 +214,16 @@ def with_added_covariance(trajectory: Trajectory, added: FloatArray) -> Trajecto
     return replace(trajectory, covariance=trajectory.covariance + added)
 
 
-def leave_one_out_findings(left_out: tuple[LeftOut, ...]) -> list[Finding]:
+def leave_one_out_findings(left_out: tuple[LeftOut, ...]) -> list[Issue]:
     """One finding for each source whose exclusion enlarged the covariance."""
     return [
-        Finding(
-            s.source,
+        Issue(
             f"without it the trajectory moves by up to {s.distance_m:.0f} m, more than the standard deviations allow; "
             "they were enlarged by the difference",
-            s.start_s,
-            s.end_s,
-            "tracker-inconsistent",
+            "tracker-inconsistent", s.source, s.start_s, s.end_s,
         )
         for s in _supported(left_out)
-    ]
+    ]  # fmt: skip
 
 
 def rejected_points(
@@ -272,8 +256,8 @@ def rejected_points(
 
 
 def edit_checks_with_rejected(
-    checks: tuple[ConsistencyCheck, ...], residuals: pd.DataFrame, rejected: dict[str, FloatArray]
-) -> tuple[ConsistencyCheck, ...]:
+    checks: tuple[Check, ...], residuals: pd.DataFrame, rejected: dict[str, FloatArray]
+) -> tuple[Check, ...]:
     """Checks in which rejected points count as edited."""
     again = {}
     for name, times in rejected.items():
@@ -288,25 +272,25 @@ def edit_checks_with_rejected(
     return (*made, *(v for name, v in again.items() if name not in known))
 
 
-def rejected_point_findings(rejected: dict[str, FloatArray]) -> list[Finding]:
+def rejected_point_findings(rejected: dict[str, FloatArray]) -> list[Issue]:
     """One finding for each stretch of rejected points."""
     out = []
     for name, times in rejected.items():
         for part in np.split(times, np.flatnonzero(np.diff(times) > SAME_STRETCH_S) + 1):
             remark = f"{len(part)} track points contradict all other data, with which its other points agree: rejected"
-            out.append(Finding(name, remark, float(part[0]), float(part[-1]), "track-points-rejected"))
+            out.append(Issue(remark, "track-points-rejected", name, float(part[0]), float(part[-1])))
     return out
 
 
 # ---- prior inflation
 
 
-def inflated_priors(checks: tuple[ConsistencyCheck, ...], table: pd.DataFrame) -> dict[str, float]:
+def inflated_priors(checks: tuple[Check, ...], table: pd.DataFrame) -> dict[str, float]:
     """Standard deviations to take instead, by name of the error; empty where every data sheet is consistent.
 
     Parameters
     ----------
-    checks : tuple of ConsistencyCheck
+    checks : tuple of Check
     table : DataFrame
         ``name, treated, prior_sd, estimate, sd``.
     """
@@ -343,29 +327,26 @@ def with_inflated_priors(problem: Problem, inflated_sd: dict[str, float]) -> Pro
 
 def prior_inflation_findings(
     table: pd.DataFrame, inflated_sd: dict[str, float], start_s: float, end_s: float
-) -> list[Finding]:
+) -> list[Issue]:
     """One finding for each error whose prior was inflated."""
     rows = table.set_index("name")
     return [
-        Finding(
-            name.split()[0],
+        Issue(
             f"{name}: {rows.estimate[name]:.3g} ± {rows.sd[name]:.2g} {rows.unit[name]}; a priori sd inflated from "
             f"{rows.prior_sd[name]:.2g} to {sd:.2g} {rows.unit[name]}",
-            start_s,
-            end_s,
-            "prior-inflated",
+            "prior-inflated", name.split()[0], start_s, end_s,
         )
         for name, sd in inflated_sd.items()
         if name in rows.index
-    ]
+    ]  # fmt: skip
 
 
 # ---- fault hypotheses
 
 
 def isolate_faults(
-    checks: tuple[ConsistencyCheck, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
-) -> tuple[FaultHypothesis, ...]:
+    checks: tuple[Check, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
+) -> tuple[Issue, ...]:
     """Fault hypotheses, the most likely first; none where every check passes."""
     failed = [v for v in checks if not v.passed]
     if not failed:
@@ -374,7 +355,7 @@ def isolate_faults(
     return (*first, *_from_checks(failed, left_out))
 
 
-def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesis, ...]:
+def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[Issue, ...]:
     """What one fault explains best, with those that are hardly less likely."""
     if not singles:
         return ()
@@ -383,38 +364,36 @@ def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[FaultHypothesi
     sources = tuple(dict.fromkeys(name for one in named for name in one.sources))
     rest = singles[len(named) :]
     odds = f"; odds over {rest[0].words}: 1e{(named[0].gain - rest[0].gain) / np.log(10.0):.0f}" if rest else ""
-    return (FaultHypothesis(f"{words}: this one fault explains the data best{odds}", named[0].code, sources),)
+    return (Issue(f"{words}: this one fault explains the data best{odds}", named[0].code, sources),)
 
 
-def _from_checks(failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...]) -> tuple[FaultHypothesis, ...]:
+def _from_checks(failed: list[Check], left_out: tuple[LeftOut, ...]) -> tuple[Issue, ...]:
     """What the failed checks and the comparison of trackers say."""
     inertial = [v for v in failed if v.code == "data-sheet" and v.source in TRIADS]
     inertial += [v for v in failed if v.code in _ABOUT_BOTH + ABOUT_DECELERATION]
     shared = [v for v in failed if v.code in _SHARED_CODES or (v.code == "data-sheet" and v.source == SITES)]
-    out = [FaultHypothesis(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
+    out = [Issue(f"radar sites: {v.remark}", "sites", (v.source,)) for v in shared]
     if any(is_about(v, s.source) for v in failed for s in left_out):
         out.append(_tracker_hypothesis(failed, left_out, inertial))
     elif not left_out:
         out += _single_tracker_hypothesis(failed)
     resolved = any(s.resolves for s in left_out)
     if inertial and not resolved and not any(h.code == "inertial-or-motion" for h in out):
-        out.append(FaultHypothesis(_inertial(inertial), "inertial-sensors", _inertial_sources(inertial)))
+        out.append(Issue(_inertial(inertial), "inertial-sensors", _inertial_sources(inertial)))
     if any(v.code == "filter-smoother" for v in failed) and not out:
         what = "motion: filter and smoother differ by more than sensor noise and errors explain"
-        out.append(FaultHypothesis(what, "motion"))
-    rest: list[tuple[str, ConsistencyCheck, tuple[str, ...]]] = []
+        out.append(Issue(what, "motion"))
+    rest: list[tuple[str, Check, tuple[str, ...]]] = []
     rest += [("attitude", v, (v.source,)) for v in failed if v.code.startswith("attitude-")]
     of_air = sorted((v for v in failed if v.code in _AIR_SOURCES), key=lambda v: -v.value / v.high)
     rest += [("air", v, _AIR_SOURCES[v.code]) for v in of_air]  # the farthest beyond its limit first
     rest += [("error-model", v, (v.source,)) for v in failed if v.code == "physical-range"]
     rest += [("stated-noise", v, (v.source,)) for v in failed if is_generous(v)]
-    sentences = {FaultHypothesis(f"{what}: {v.remark}", what, names): None for what, v, names in rest}
+    sentences = {Issue(f"{what}: {v.remark}", what, names): None for what, v, names in rest}
     return (*out, *sentences)
 
 
-def _tracker_hypothesis(
-    failed: list[ConsistencyCheck], left_out: tuple[LeftOut, ...], inertial: list[ConsistencyCheck]
-) -> FaultHypothesis:
+def _tracker_hypothesis(failed: list[Check], left_out: tuple[LeftOut, ...], inertial: list[Check]) -> Issue:
     """Hypothesis from the leave-one-out comparison, where a check about a tracker failed."""
     resolving = [s for s in left_out if s.resolves]
     names = tuple(s.source for s in resolving)
@@ -423,10 +402,10 @@ def _tracker_hypothesis(
         own = _symptoms([v for v in failed if is_about(v, s.source)])
         moves = f", and the trajectory moves by up to {s.distance_m:.0f} m" if s.inconsistent else ""
         own = f" ({own})" if own else ""
-        return FaultHypothesis(f"{s.source}{own}: without it all other data are consistent{moves}", "tracker", names)
+        return Issue(f"{s.source}{own}: without it all other data are consistent{moves}", "tracker", names)
     if len(resolving) > 1:
         distance = max(s.distance_m for s in resolving)
-        return FaultHypothesis(
+        return Issue(
             f"{' and '.join(names)} contradict each other by up to {distance:.0f} m: without either the rest is "
             "consistent, and the data do not show which is wrong; check their sites, calibration and time tags",
             "trackers-contradict",
@@ -436,26 +415,26 @@ def _tracker_hypothesis(
     if len(touched) == 1 and not inertial:
         own = _symptoms([v for v in failed if is_about(v, touched[0])])
         what = f"{touched[0]} ({own}): only its residuals fail, though the rest is not consistent without it"
-        return FaultHypothesis(what, "tracker-residuals", tuple(touched))
+        return Issue(what, "tracker-residuals", tuple(touched))
     largest = _inertial(inertial) if inertial else "no data sheet's error stands out"
-    return FaultHypothesis(
+    return Issue(
         f"inertial sensors or motion: without no single tracker is the rest consistent; {largest}",
         "inertial-or-motion",
         _inertial_sources(inertial),
     )
 
 
-def _single_tracker_hypothesis(failed: list[ConsistencyCheck]) -> list[FaultHypothesis]:
+def _single_tracker_hypothesis(failed: list[Check]) -> list[Issue]:
     """What can be concluded where no tracker could be left out."""
     about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in TRIADS)]
     about = [v for v in about if not is_generous(v)]
     if not about:
         return []
     what = f"tracker or motion ({_symptoms(about)}): with one tracker alone the two cannot be separated"
-    return [FaultHypothesis(what, "tracker-or-motion", tuple(dict.fromkeys(v.source for v in about)))]
+    return [Issue(what, "tracker-or-motion", tuple(dict.fromkeys(v.source for v in about)))]
 
 
-def _inertial(checks: list[ConsistencyCheck]) -> str:
+def _inertial(checks: list[Check]) -> str:
     worst = max(checks, key=lambda v: abs(v.value) / max(v.high, np.finfo(float).tiny))
     if worst.component.startswith("mount"):
         names = " or ".join(f"{v.source} {v.component}" for v in checks if v.component.startswith("mount"))
@@ -465,10 +444,10 @@ def _inertial(checks: list[ConsistencyCheck]) -> str:
     return f"inertial sensors: {worst.remark}"
 
 
-def _inertial_sources(checks: list[ConsistencyCheck]) -> tuple[str, ...]:
+def _inertial_sources(checks: list[Check]) -> tuple[str, ...]:
     names = [name for v in checks for name in ((v.source,) if v.source else TRIADS)]
     return tuple(dict.fromkeys(names))
 
 
-def _symptoms(checks: list[ConsistencyCheck]) -> str:
+def _symptoms(checks: list[Check]) -> str:
     return "; ".join(dict.fromkeys(v.symptom for v in checks))

@@ -40,11 +40,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import erf
 
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, Issue
 from flightmodel.gate import runs
 from flightmodel.instruments import TriadSpec
 from flightmodel.statistics import NORMAL_MAD
-from flightmodel.telemetry import Finding, TriadRecord
+from flightmodel.telemetry import TriadRecord
 
 _SLOPE_SPAN_S = 0.06  # over which a signal beside a gap is straight: a seventh of a period at 2.5 Hz
 _NEARBY_STEPS = 31  # of which the median is the usual step
@@ -66,7 +66,7 @@ class BridgedSensor:
         White-noise density from each time to the next, body axes.
     in_gap : (n,) bool
         Whether the interval from each time to the next lies in a gap of any axis.
-    findings : tuple of Finding
+    findings : tuple of Issue
     offsets : tuple of TransientOffset
         All that were found, whether accepted or not.
     """
@@ -76,7 +76,7 @@ class BridgedSensor:
     measured_sensor: FloatArray
     density: FloatArray
     in_gap: BoolArray
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     offsets: tuple[TransientOffset, ...] = ()
 
     @property
@@ -132,12 +132,12 @@ def bridge(record: TriadRecord, sensor: int = 0, rejected: tuple[TransientOffset
         which = "samples" if len(lost) == 3 else f"usable samples of {names}"
         remark = f"no {which} for {end - start:.3f} s, bridged; 1 sd of the integral over the gap "
         remark += ", ".join(f"{lost[a]:.3g}" for a in sorted(lost)) + f" (SI; sensor {names})"
-        findings.append(Finding(spec.name, remark, start, end, "gap-bridged"))
+        findings.append(Issue(remark, "gap-bridged", spec.name, start, end))
     density = density @ (spec.dcm_body_sensor**2).T
     return BridgedSensor(spec, grid, column, density, in_gap, tuple(findings), offsets)
 
 
-def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Finding]]:
+def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, list[Issue]]:
     """Times, samples and which of them are good (n, 3), from the first to the last time that all axes measure."""
     t, x, spec = record.time_s, record.measured_sensor, record.spec
     good = np.isfinite(x)
@@ -158,7 +158,7 @@ def _usable(record: TriadRecord) -> tuple[FloatArray, FloatArray, BoolArray, lis
     ended = [_AXES[a] for a in range(3) if np.isfinite(x[last + 1 :, a]).any() and inside[a][-1] == last]
     if ended and last < len(t) - _LEAST_SAMPLES:
         remark = f"{', '.join(ended)} frozen at one value to the end of the record: the trajectory ends before it"
-        findings.append(Finding(spec.name, remark, float(t[last]), float(t[-1]), "frozen-data"))
+        findings.append(Issue(remark, "frozen-data", spec.name, float(t[last]), float(t[-1])))
     return t[rows], x[rows], good[rows], findings
 
 
@@ -175,7 +175,7 @@ def _find_offsets(
 
 
 def _exclude(
-    t: FloatArray, x: FloatArray, good: BoolArray, rejected: list[TransientOffset], findings: list[Finding], name: str
+    t: FloatArray, x: FloatArray, good: BoolArray, rejected: list[TransientOffset], findings: list[Issue], name: str
 ) -> FloatArray:
     """Take rejected samples out of ``good`` (n, 3), in place, and return them; NaN where there is none (n, 3)."""
     out = np.full(x.shape, np.nan)
@@ -183,25 +183,22 @@ def _exclude(
         rows = np.flatnonzero((t >= d.start_s) & (t <= d.end_s) & good[:, d.axis])
         out[rows, d.axis], good[rows, d.axis] = x[rows, d.axis], False
         remark = f"transient offset of {_AXES[d.axis]} by about {d.offset:.3g} (SI): excluded; added to process noise"
-        findings.append(Finding(name, remark, d.start_s, d.end_s, "transient-offset"))
+        findings.append(Issue(remark, "transient-offset", name, d.start_s, d.end_s))
     return out
 
 
-def _exclude_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray) -> list[Finding]:
+def _exclude_repeated(spec: TriadSpec, t: FloatArray, x: FloatArray, good: BoolArray) -> list[Issue]:
     """Take blocks of samples that repeat others out of ``good`` (n, 3), in place; one finding for each."""
     whole = np.flatnonzero(good.all(axis=1))
     repeated, blocks = repeated_samples(x[whole], spec.noise_sd)
     good[whole[repeated]] = False
     return [
-        Finding(
-            spec.name,
+        Issue(
             f"{b - a + 1} samples repeat those from {t[whole[a0]]:.3f} s on under other times: excluded",
-            float(t[whole[a]]),
-            float(t[whole[b]]),
-            "repeated-block",
+            "repeated-block", spec.name, float(t[whole[a]]), float(t[whole[b]]),
         )
         for a, b, a0 in blocks
-    ]
+    ]  # fmt: skip
 
 
 def _with_bridges(t: FloatArray) -> FloatArray:
@@ -530,12 +527,12 @@ def frozen_rows(record: TriadRecord) -> BoolArray:
     return out
 
 
-def frozen_findings(record: TriadRecord) -> list[Finding]:
+def frozen_findings(record: TriadRecord) -> list[Issue]:
     """Spans of `frozen_rows`, which are left out."""
     first, last = runs(frozen_rows(record))
     t, remark = record.time_s, "frozen at one value (the end of its range, or no new data): left out"
     return [
-        Finding(record.spec.name, remark, float(t[a]), float(t[b]), "frozen-data")
+        Issue(remark, "frozen-data", record.spec.name, float(t[a]), float(t[b]))
         for a, b in zip(first, last, strict=True)
     ]
 

@@ -29,17 +29,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flightmodel.checks import FloatArray, IntArray
+from flightmodel.checks import Check, FloatArray, IntArray
 from recon import ekf, propagation, setup, single_faults, smoother
 from recon._measurement_kernels import DECELERATION
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import Problem, with_servo_lag
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
 
 THINNED_STEP_S = 0.5  # one only linearises about that path
-_MOST_THINNED_PASSES = 6  # a bound: the passes with all points go on from there
 _FARTHEST_SD = 3.0  # where a pass overshoots, the next one corrects it from within the prior
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _FOLLOWED_RAD = 0.5  # sd of a phase whose 3 sd are a quarter of a turn, beyond which lateral force corrects it wrongly
@@ -70,11 +68,11 @@ class SpinPhase:
     prior_sd_rad: float
     odds: float
 
-    def check(self) -> ConsistencyCheck:
+    def check(self) -> Check:
         """Is one phase far likelier than all others?"""
         prior = f"the gyros' scale and bias leave {np.rad2deg(self.prior_sd_rad):.0f} deg (1 sd) of rotation open"
         odds = f"odds of one phase over the next {np.exp(self.odds):.0f} to 1" if self.odds < 14.0 else "one phase fits"
-        return consistency_check(
+        return Check.of(
             "spin-phase", "phase of the spin", self.odds, _LEAST_ODDS, np.inf, f"{prior}; {odds}", f"{prior}; {odds}",
             advice="another number of turns explains the data as well: state a later attitude, a surer scale, or use "
             "magnetometer and Sun sensors (attitude_sensors)", source="rates", component="scale",
@@ -136,13 +134,13 @@ def converged(
     From the filter's own estimate on, or from a reference. ``forward`` makes a pass about one and says about which, as
     `ekf.forward` does by itself; then one that the first pass does not move is the answer.
     """
-    for k in range(_MOST_THINNED_PASSES):
+    for k in range(6):  # the passes with all points go on from there
         thinned = with_servo_lag(thinned, reference)
         if forward is None:
             run = ekf.forward(thinned, reference, engine)
         else:
             run, reference = forward(thinned, reference)
-        smoothed = smoother.smooth(thinned, run, False, engine)
+        smoothed = smoother.smooth(thinned, run, with_covariance=False)
         judged = k or (forward is not None and reference is not None)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if judged else np.inf
         reference = bounded_drivers(thinned, smoothed.states(run.charts))

@@ -28,8 +28,7 @@ and noise:
 
 A tracker's angle noise is noise of its line of sight: ``angle_sd`` in elevation and in traverse, hence
 ``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` is ``"axis"`` for a radar whose azimuth readings
-scatter by ``angle_sd`` at any elevation. The numpy form below serves the filterpy engine; compiled:
-`recon._measurement_kernels`.
+scatter by ``angle_sd`` at any elevation. Predictions and partials: `recon._measurement_kernels`.
 
 The antenna follows the target as a second-order servo without velocity lag: damping and integral of the angle's error
 drive it, ``F(s) = (2 z w s + w^2) / (s^2 + 2 z w s + w^2)`` with ``w`` its bandwidth and ``z = 1 / sqrt(2)``
@@ -56,7 +55,6 @@ from flightmodel.checks import FloatArray, IntArray
 from flightmodel.earth import WGS84, Planet
 from flightmodel.tables import spacing_s
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
-from recon import _measurement_kernels
 from recon._measurement_kernels import (
     DECELERATION,
     FIELD,
@@ -69,15 +67,11 @@ from recon._measurement_kernels import (
     VELOCITY,
 )
 from recon.imu_screening import frozen_rows
-from recon.propagation import Motion
 from recon.state import DRIVERS, ErrorModel, States, right_jacobian
 
 REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
-# the servo's lag is exact for an angle that runs straight between steps: the path's own steps are a tenth of a second
-_STEPS_A_PERIOD, _STEPS_S = 50, (0.01, 0.1)
-_SURFACE_REFRACTIVITY = 3.2e-4  # n - 1 at a site near the sea
 COMPONENTS = {
     RADAR: ("range", "azimuth", "elevation"),
     POSITION: ("north", "east", "down"),
@@ -230,7 +224,7 @@ def radar_instrument(
     if traverse:
         elevation = np.where(np.isfinite(record.range_az_el[:, 2]), record.range_az_el[:, 2], 0.0)
         sd[:, 1] /= np.maximum(np.cos(elevation), 1e-3)
-    known = np.tile([_SURFACE_REFRACTIVITY, 0.0, 0.0], (len(sd), 1))
+    known = np.tile([3.2e-4, 0.0, 0.0], (len(sd), 1))  # n - 1 at a site near the sea
     place = earth.ecef_from_geodetic(*site.geodetic, planet)
     dcm = earth.dcm_ned_ecef(site.latitude_rad, site.longitude_rad)
     made = instrument_of(
@@ -375,121 +369,6 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
     return [i for i in out if len(i.time_s)]
 
 
-@dataclass(frozen=True)
-class NodeMotion:
-    """Attitude matrix, turning in body axes and acceleration against the Earth.
-
-    Turning (12, 3) are the inertial rate, its rate of change (the partial by the gyros' clock as well), the specific
-    force, and the rate's partials by the gyros' nine other errors.
-    """
-
-    position_ecef_m: FloatArray
-    velocity_ecef_mps: FloatArray
-    dcm_ecef_body: FloatArray
-    turning_body: FloatArray
-    acceleration_ecef_mps2: FloatArray
-    motion: Motion | None = None  # of which a deceleration takes the air
-
-    @property
-    def planet(self) -> Planet:
-        """Planet below; the Earth where no motion is stated."""
-        return WGS84 if self.motion is None else self.motion.planet
-
-
-def predict(
-    instrument: Instrument, known: FloatArray, e: FloatArray, at: NodeMotion
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Prediction (3,) and partials by state (3, 9) and by the instrument's own errors (3, `SLOTS`), in numpy.
-
-    ``e`` (`SLOTS`,) are the errors. Twin of `recon._measurement_kernels.predict`.
-    """
-    by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
-    if instrument.kind == DECELERATION:
-        h, motion = np.zeros(3), (at.position_ecef_m, at.velocity_ecef_mps, at.acceleration_ecef_mps2)
-        _measurement_kernels.deceleration_at(at.motion, e, *motion, h, by_state, by_error)
-        return h, by_state, by_error
-    if instrument.kind in (FIELD, SUN):
-        body = at.dcm_ecef_body.T @ known
-        model = magnetometer_model if instrument.kind == FIELD else sun_model
-        reading, by_body, by_error[: len(instrument.components)] = model(instrument.dcm, body, e)
-        by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
-        return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
-    c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
-    turning, change, force = at.turning_body[:3]
-    turning = turning - at.planet.rate_radps * c[2]
-    lever_velocity = np.cross(turning, arm)
-    moving = at.velocity_ecef_mps + c @ lever_velocity
-    swing = np.cross(change, arm) + np.cross(turning, lever_velocity)
-    pulled = at.acceleration_ecef_mps2 + c @ swing
-    jerk = np.cross(turning, force + swing)
-    point = at.position_ecef_m + c @ arm - tau * moving + 0.5 * tau**2 * pulled - tau**3 / 6.0 * c @ jerk
-    speed, pulled = moving - tau * pulled + 0.5 * tau**2 * c @ jerk, pulled - tau * c @ jerk
-    effective = arm - tau * (lever_velocity - 0.5 * tau * swing) - tau**3 / 6.0 * jerk
-    sweep = lever_velocity - tau * swing + 0.5 * tau**2 * jerk
-    by_gyros = -c @ rotations.skew(arm) @ at.turning_body[[*range(3, 12), 1]].T
-    if instrument.kind == VELOCITY:
-        by_state[:, 3:6] = instrument.dcm
-        by_state[:, 6:9] = -instrument.dcm @ c @ rotations.skew(sweep)
-        by_error[:, 0:3] = np.eye(3)
-        by_error[:, 3], by_error[:, 4:14] = -instrument.dcm @ pulled, instrument.dcm @ by_gyros
-        return instrument.dcm @ speed + e[0:3], by_state, by_error
-    if instrument.kind == RANGE_RATE:
-        sight = point - instrument.site_ecef_m
-        u = sight / np.linalg.norm(sight)
-        across = (speed - (u @ speed) * u) / np.linalg.norm(sight)
-        by_state[0, 0:3], by_state[0, 3:6] = across, u - tau * across
-        by_state[0, 6:9] = -u @ c @ rotations.skew(sweep)
-        by_state[0, 6:9] -= across @ c @ rotations.skew(effective)
-        by_error[0, 0:2], by_error[0, 3] = 1.0, -across @ speed - u @ pulled
-        by_error[0, 4:14] = by_state[0, 3:6] @ by_gyros
-        return np.array([u @ speed + e[0] + e[1], 0.0, 0.0]), by_state, by_error
-    if instrument.kind == RADAR:
-        h, m = _radar(instrument, known, e, point, by_error)
-    elif instrument.kind == POSITION:
-        m, by_error[:, 0:3] = instrument.dcm, np.eye(3)
-        h = m @ (point - instrument.site_ecef_m) + e[0:3]
-    else:
-        h, m = _height(instrument, e, point, by_error, at.planet)
-    by_state[:, 0:3] = m
-    by_state[:, 3:6] = -tau * m
-    by_state[:, 6:9] = -m @ c @ rotations.skew(effective)
-    by_error[:, 3] = -m @ speed
-    return h, by_state, by_error
-
-
-def _radar(
-    instrument: Instrument, known: FloatArray, e: FloatArray, point: FloatArray, by_error: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    ned = instrument.dcm @ (point - instrument.site_ecef_m)
-    moved = _site_partials(instrument, ned)
-    n, east, d = ned + moved @ (e[13:16] + e[17:20])
-    slant, az, el = sight(n, east, d)
-    partials = sight_partials(n, east, d)
-    sec = 1.0 / max(np.cos(el), 1e-3)
-    tan = np.sin(el) * sec
-    by_error[:, 0:3] = np.eye(3)
-    by_error[1, 4:6] = -tan * np.cos(az), -tan * np.sin(az)
-    by_error[2, 4:6] = np.sin(az), -np.cos(az)
-    by_error[2, 6], by_error[1, 7], by_error[1, 8] = np.cos(el), sec, tan
-    by_error[1, 9], by_error[2, 10] = sec, 1.0
-    by_error[2, 11] = known[0] * np.cos(el) / max(np.sin(el), 0.035)
-    by_error[0, 12] = slant
-    by_error[1, [16, 20]] = 1.0
-    by_error[0, 21] = 1.0
-    by_error[1:, 22] = known[1:]
-    # the errors themselves change with azimuth and elevation
-    g = np.eye(3) + np.diag([e[12], 0.0, 0.0])
-    g[1, 1] += tan * (np.sin(az) * e[4] - np.cos(az) * e[5])
-    g[1, 2] = sec**2 * (e[8] - np.cos(az) * e[4] - np.sin(az) * e[5]) + sec * tan * (e[7] + e[9])
-    g[2, 1] = np.cos(az) * e[4] + np.sin(az) * e[5]
-    cosecant_square = 1.0 / np.sin(el) ** 2 if np.sin(el) > 0.035 else np.sin(el) / 0.035
-    g[2, 2] -= np.sin(el) * e[6] + known[0] * cosecant_square * e[11]
-    others = np.delete(np.arange(SLOTS), 3)
-    h = np.array([slant, az + known[1], el + known[2]]) + by_error[:, others] @ e[others]
-    by_error[:, 13:16] = by_error[:, 17:20] = g @ partials @ moved
-    return h, g @ partials @ instrument.dcm
-
-
 def sight(n: Any, east: Any, d: Any) -> tuple[Any, Any, Any]:
     """Range, azimuth, elevation of a point north, east, down of a site, or of points (k,)."""
     level = np.hypot(n, east)
@@ -515,7 +394,8 @@ def servo_lag(instrument: Instrument, time_s: FloatArray, states: States, at_s: 
 
     c = rotations.dcm_from_q(states.q_ecef_body)
     point = CubicHermiteSpline(time_s, states.position_ecef_m + c @ instrument.arm_body_m, states.velocity_ecef_mps)
-    step_s = float(np.clip(1.0 / (_STEPS_A_PERIOD * instrument.servo_hz), *_STEPS_S))
+    # exact for an angle that runs straight between steps: the path's own are a tenth of a second
+    step_s = float(np.clip(1.0 / (50 * instrument.servo_hz), 0.01, 0.1))
     even_s, step_s = np.linspace(
         time_s[0], time_s[-1], 1 + int(np.ceil((time_s[-1] - time_s[0]) / step_s)), retstep=True
     )
@@ -543,27 +423,6 @@ def sight_partials(n: float, east: float, d: float) -> FloatArray:
             [d * n / (slant**2 * level), d * east / (slant**2 * level), -level / slant**2],
         ]
     )
-
-
-def _site_partials(instrument: Instrument, ned: FloatArray) -> FloatArray:
-    """Partials (3, 3) of north, east, down by the stated place's error to the north, to the east and upwards."""
-    per_m = 1.0 / float(np.linalg.norm(instrument.site_ecef_m))
-    tan_lat = -instrument.dcm[2, 2] / max(instrument.dcm[0, 2], 1e-6)
-    turns = per_m * np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, tan_lat]])  # of a metre to the north, to the east
-    moved = np.diag([1.0, 1.0, -1.0])
-    moved[:, :2] -= np.cross(turns, ned).T
-    return moved
-
-
-def _height(
-    instrument: Instrument, e: FloatArray, point: FloatArray, by_error: FloatArray, planet: Planet
-) -> tuple[FloatArray, FloatArray]:
-    latitude, longitude, height = earth.geodetic_from_ecef(point, planet)
-    m = np.zeros((3, 3))
-    m[0] = -(1.0 + e[1]) * earth.dcm_ned_ecef(float(latitude), float(longitude))[2]
-    above = float(height) - instrument.site_ecef_m[0]
-    by_error[0, 0:3] = 1.0, above, 1.0
-    return np.array([float(height) + e[0] + above * e[1] + e[2], 0.0, 0.0]), m
 
 
 def magnetometer_model(

@@ -47,8 +47,7 @@ _REACH = np.log(100.0)  # farther from what is stated the numbers of flight.toml
 _LEAST_CHANGE = 0.1  # of a logarithm, that is worth proposing
 _LEAST_GAIN = np.log(20.0)  # of the likelihood, below which nothing is proposed: levels accepted before stay
 _DIFFERENCE = 0.02  # of a logarithm: its effect on log L is far above the rounding of thousands of terms
-_ENOUGH = 0.02  # log likelihood that a further step would gain
-_MOST_STEPS, _MOST_ROUNDS = 15, 3  # bounds
+_MOST_ROUNDS = 3
 _RELINEARISED = 0.1  # change of a logarithm that moves the trajectory about which passes are linearised
 # of each kind of record: fields of its noise, which may only scale what is stated, and time constants
 _TRACKERS = {
@@ -152,13 +151,13 @@ def noise_levels(
     Raises
     ------
     GateError
-        ``noise-unknown``: nothing states a level above zero. Others as `recon.reconstruct.reconstruct`.
+        ``input-missing``: nothing states a level above zero. Others as `recon.reconstruct.reconstruct`.
     """
     settings = settings or Settings.from_mapping(telemetry.reconstruction)
     report = progress or (lambda _fraction, _what: None)
     places = _places(telemetry, settings)
     if not places:
-        raise GateError("noise levels: nothing in flight.toml states one above zero", code="noise-unknown")
+        raise GateError("noise levels: nothing in flight.toml states one above zero", code="input-missing")
     stated = np.log([place.of(telemetry) for place in places])
     slow = np.array([place.field.endswith("time_constant_s") for place in places])
     prior = stated - np.where(slow, 0.0, _PRIOR_SD**2)
@@ -269,7 +268,8 @@ class _Likelihood:
     def maximised(self, start: FloatArray) -> FloatArray:
         """Levels of the highest posterior."""
         first = self.cost(start)
-        options = {"eps": _DIFFERENCE, "maxiter": _MOST_STEPS, "ftol": _ENOUGH / max(abs(first), 1.0)}
+        # enough where a further step would gain 0.02 of log likelihood
+        options = {"eps": _DIFFERENCE, "maxiter": 15, "ftol": 0.02 / max(abs(first), 1.0)}
         bounds = [(a - _REACH, a + _REACH) for a in self.prior]
         found = minimize(self.cost, start, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x) if found.fun < first else start

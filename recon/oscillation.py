@@ -41,10 +41,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, Check, FloatArray
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.fault_detection import LOG_LIKELIHOOD_LIMIT
 from recon.imu_screening import BridgedSensor
 from recon.time_bias import CORRELATION_S, SLOWEST_S, has_gap, smoothed_body_axes
@@ -60,8 +59,6 @@ _LEAST_EXPLAINED = 0.95  # share of the lateral force's square, by the best hypo
 # unequal inertia, c.g. offsets and the joint turn the relation: 0.37 deg rms, at most 0.63, on 13 sound flights
 _LEAST_ROLL_RAD = np.deg2rad(2.0)
 _ROLL_SD = 4.0
-# speed of sound in thin air, 270 to 340: C_A and C_mq change slowly with Mach number; slower is no flight
-_SOUND_MPS, _DESCENT_MPS, _SLOWEST_MPS = 300.0, 100.0, 1.0
 # C_mq less the stated one, in its sd, among which it is looked for; dense where an unknown speed may make it small
 _DAMPING_SD = np.array([0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0])
 _DAMPING_SD = np.concatenate([-_DAMPING_SD[:0:-1], _DAMPING_SD])
@@ -228,9 +225,10 @@ def _damping_by_force(vehicle: Vehicle, speed: tuple[FloatArray, FloatArray] | N
 
     Without a speed that of a slow descent, where damping is largest, and anything between it and none.
     """
-    time_s, speed_mps = (np.zeros(1), np.full(1, _DESCENT_MPS)) if speed is None else speed
-    speed_mps = np.maximum(speed_mps, _SLOWEST_MPS)
-    ca, _, _, cmq = vehicle.aero.at(speed_mps / _SOUND_MPS, 0.0).T
+    time_s, speed_mps = (np.zeros(1), np.full(1, 100.0)) if speed is None else speed
+    speed_mps = np.maximum(speed_mps, 1.0)  # slower is no flight
+    # sound in thin air has 270 to 340 m/s: C_A and C_mq change slowly with Mach number
+    ca, _, _, cmq = vehicle.aero.at(speed_mps / 300.0, 0.0).T
     inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
     per_cmq = vehicle.mass_kg * vehicle.reference.length_m**2 / (2.0 * speed_mps * ca * inertia)
     sd = np.full(len(cmq), vehicle.uncertainty.cmq)
@@ -330,7 +328,7 @@ def common_angle(near: float, logs: FloatArray, step: float) -> tuple[float, flo
     return float(near + weight @ off / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) -> ConsistencyCheck:
+def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) -> Check:
     """Whether both sensors have one set of axes, as far as the oscillation shows it."""
     names = f"{force.spec.name} and {rate.spec.name}"
     off = found.kind in (ROLL, MIRRORED)
@@ -344,14 +342,5 @@ def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) ->
         bad += rate.spec.name
         advice = "check the mount and the column order of both"
     value = max(found.gain, LOG_LIKELIHOOD_LIMIT + 1.0) if off else 0.0
-    return consistency_check(
-        "triads-axes",
-        f"axes of {names}",
-        value,
-        0.0,
-        LOG_LIKELIHOOD_LIMIT,
-        good,
-        bad,
-        advice=advice,
-        component=found.kind,
-    )
+    limits, kind = (0.0, LOG_LIKELIHOOD_LIMIT), found.kind
+    return Check.of("triads-axes", f"axes of {names}", value, *limits, good, bad, advice=advice, component=kind)

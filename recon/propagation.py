@@ -62,12 +62,10 @@ from recon import _filter_kernels
 from recon.imu_screening import BridgedSensor
 from recon.state import States
 
-_STRAPDOWN_DRIVERS, _CLOCKS, _BALLISTIC_DRIVERS = 18, 2, 6
 SAME_INSTANT_S = 2e-6
 GRID_STEP_S = 0.05  # in ballistic flight
-AIR_FROM_M, _AIR_TO_M, AIR_STEP_M = -500.0, 900e3, 100.0
-_POWERED_CORRELATION_S = 1.0  # a thrust that may be anything keeps its value for about so long
-_STATED_CORRELATION_S = 1.0  # correlation time of a stated disturbance
+AIR_FROM_M, AIR_STEP_M = -500.0, 100.0
+_CORRELATION_S = 1.0  # a stated disturbance, or a thrust that may be anything, keeps its value for about so long
 
 
 class Motion(NamedTuple):
@@ -117,7 +115,7 @@ class Motion(NamedTuple):
     @property
     def drivers(self) -> int:
         """Number of errors that the motion depends on."""
-        return _BALLISTIC_DRIVERS if self.ballistic else _STRAPDOWN_DRIVERS + _CLOCKS * self.clocks
+        return 6 if self.ballistic else 18 + 2 * self.clocks
 
     def air_at(self, height_m: FloatArray) -> FloatArray:
         """Columns of ``air``, (5, n), at heights (n,)."""
@@ -295,7 +293,7 @@ def fill_between(motion: Motion, node_index: IntArray, known: IntArray, at_known
 
 def air_table(sounding: Sounding) -> FloatArray:
     """Rows of `Motion.air` on the fixed altitudes above."""
-    altitude = np.arange(air_from_m(sounding.planet), _AIR_TO_M, AIR_STEP_M)
+    altitude = np.arange(air_from_m(sounding.planet), 900e3, AIR_STEP_M)
     air = profile_from_sounding(sounding).at(altitude)
     wind = air.wind_ned_mps
     return np.column_stack([np.log(air.density_kgpm3), wind[:, 0], wind[:, 1], air.density_sd, air.wind_sd_mps])
@@ -315,7 +313,7 @@ def ballistic_motion(
     t = _with_nodes(steps, node_time_s)
     density = np.full((len(t), 3), spec.acceleration_density**2)
     for start, end in spec.powered_s:
-        density[(t >= start) & (t < end)] += spec.powered_sd_mps2**2 * _POWERED_CORRELATION_S
+        density[(t >= start) & (t < end)] += spec.powered_sd_mps2**2 * _CORRELATION_S
     still = np.zeros((len(t), 3))
     motion = Motion(
         True, t, still, still, density, still, np.eye(3), np.eye(3), False, air_table(sounding),
@@ -332,7 +330,7 @@ def with_disturbances(motion: Motion, spec: MotionSpec) -> Motion:
     force, rate = motion.force_density.copy(), motion.rate_density.copy()
     for d in spec.disturbed:
         inside = (motion.time_s >= d.start_s) & (motion.time_s < d.end_s)
-        force[inside] += d.sd_mps2**2 * _STATED_CORRELATION_S
+        force[inside] += d.sd_mps2**2 * _CORRELATION_S
         if not motion.ballistic:  # which has no rotation
-            rate[inside] += d.sd_radps**2 * _STATED_CORRELATION_S
+            rate[inside] += d.sd_radps**2 * _CORRELATION_S
     return motion._replace(force_density=force, rate_density=rate)

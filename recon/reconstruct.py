@@ -38,9 +38,9 @@ import numpy as np
 import pandas as pd
 
 from flightmodel import rotations
-from flightmodel.checks import FloatArray, GateError, Progress
+from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress
 from flightmodel.earth import WGS84, name_of
-from flightmodel.telemetry import Finding, Telemetry
+from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
     consistency,
@@ -58,7 +58,7 @@ from recon import (
     tracker_time,
 )
 from recon._measurement_kernels import DECELERATION
-from recon.consistency import ConsistencyCheck, held_out_table
+from recon.consistency import held_out_table
 from recon.deceleration import deceleration_checks
 from recon.ekf import Problem, with_servo_lag
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
@@ -80,9 +80,7 @@ from recon.smoother import Smoothed
 from recon.state import KINEMATIC, States, unpacked
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
-_UNKNOWN_ROTATION_VAR = np.pi**2 / 3.0  # of an angle that may be anything
 _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
-_CONVERGED_SD = 0.01  # a pass that changes nothing by more than this part of its sd is the last
 _BLOCK = 1 << 16  # samples that are corrected at a time
 _NODES = 512  # whose covariances are unpacked at a time
 
@@ -103,7 +101,7 @@ class TrajectorySolution:
     held_out : DataFrame
         ``time_s, source, component, residual, predicted_sd``: measurements that were not used, against the smoothed
         trajectory (`recon.consistency`).
-    consistency_checks : tuple of ConsistencyCheck
+    consistency_checks : tuple of Check
     imu_time_s : (k,) float
         Times of the accelerometer's valid samples outside gyro gaps.
     specific_force_body_mps2, rate_body_radps : (k, 3) float
@@ -115,7 +113,7 @@ class TrajectorySolution:
         Rotation and specific force error per unit normal of the accelerometer's errors, `accelerometer_root`.
     triad_root : (n, 9, 18) float
         Rotation, specific force and rate error per unit normal of both triads' errors, `triad_root`.
-    findings : tuple of Finding
+    findings : tuple of Issue
         Gaps that were bridged, stretches of radar track that were edited, and so on.
     provenance : dict
     left_out : tuple of LeftOut
@@ -133,7 +131,7 @@ class TrajectorySolution:
     sensor_errors: pd.DataFrame
     residuals: pd.DataFrame
     held_out: pd.DataFrame
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    consistency_checks: tuple[Check, ...]
     imu_time_s: FloatArray
     specific_force_body_mps2: FloatArray
     rate_body_radps: FloatArray
@@ -141,7 +139,7 @@ class TrajectorySolution:
     rate_cov: FloatArray
     accelerometer_root: FloatArray
     triad_root: FloatArray
-    findings: tuple[Finding, ...]
+    findings: tuple[Issue, ...]
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
     adaptation: Adaptation = NO_ADAPTATION
@@ -270,7 +268,7 @@ def _with_corrected_clock(
     known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
     again = reconstruct_once(one.telemetry, settings, adaptation=known)
     start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
-    finding = Finding(name, f"{one.words.partition(': ')[2]}: corrected", start_s, end_s, "clock-corrected")
+    finding = Issue(f"{one.words.partition(': ')[2]}: corrected", "clock-corrected", name, start_s, end_s)
     failed = tuple(replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag")
     checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
     return one.telemetry, replace(again, consistency_checks=checks, findings=(*again.findings, finding))
@@ -287,7 +285,7 @@ def _with_tags_set_back(
     return again if any(all(v.passed for v in one.consistency_checks) for one in (again, first)) else first
 
 
-def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[ConsistencyCheck]:
+def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[Check]:
     """Checks of the inertial sensors on the pad; none without a rest, or a place."""
     points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
     return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
@@ -322,7 +320,7 @@ def _compared_leaving_one_out(
     def unmodelled(made: TrajectorySolution) -> int:
         return sum(f.code == UNMODELLED_CODE for f in made.findings)
 
-    def rerun(source: str) -> tuple[Trajectory, tuple[ConsistencyCheck, ...], bool]:
+    def rerun(source: str) -> tuple[Trajectory, tuple[Check, ...], bool]:
         report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
         without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
         other = reconstruct_once(telemetry, without, adaptation=solution.adaptation)
@@ -399,9 +397,9 @@ def reconstruct_once(
     checks += [] if phase is None else [phase.check()]
     checks += [] if sensors is None else [carried_check(spans)]
     checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
-    held_out = held_out_table(problem, run, settings.engine)
+    held_out = held_out_table(problem, run)
     checks += consistency.held_out_checks(problem, held_out, settings)
-    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places, settings)
+    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places)
     tracked = bool(trackers(telemetry, settings))
     checks += survey.place_checks(missed, settings.check_confidence, tracked)
     filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
@@ -520,7 +518,7 @@ def _oscillation_checks(
     problem: Problem,
     states: States,
     known: Adaptation,
-) -> tuple[list[ConsistencyCheck], Adaptation]:
+) -> tuple[list[Check], Adaptation]:
     """Checks of both triads against each other by the oscillation, and the adaptation with what it shows."""
     force, rate, checks = sensors.force, sensors.rate, []
     span = float(problem.time_s[0]), float(problem.time_s[-1])
@@ -579,7 +577,7 @@ def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting
     return Mounting(telemetry.t0_utc, arm, sensors.rate)
 
 
-def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Finding]:
+def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Issue]:
     """What the inertial sensors' samples show by themselves."""
     findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
     if telemetry.drag_accelerometer is not None:
@@ -620,12 +618,12 @@ def _iterate(
         problem = with_servo_lag(problem, reference)
         run, found = linearisation.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run, True, settings.engine)
+        smoothed = smoother.smooth(problem, run)
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         smoothed_states = smoothed.states(run.charts)
         i += 1
-        if moved.max() < _CONVERGED_SD or i == most:
+        if moved.max() < 0.01 or i == most:
             return problem, run, smoothed, smoothed_states, i, found, phase
         reference = linearisation.bounded_drivers(problem, smoothed_states)
         del run, smoothed  # as large as all else together, and the next pass makes its own
@@ -649,7 +647,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
         covariance = unpacked(triangles, KINEMATIC)
         covariance[:, 6:9] = 0.0
         covariance[:, :, 6:9] = 0.0
-        covariance[:, range(6, 9), range(6, 9)] = _UNKNOWN_ROTATION_VAR
+        covariance[:, range(6, 9), range(6, 9)] = np.pi**2 / 3.0  # angles that may be anything
         if any(i.kind == DECELERATION for i in problem.instruments):
             covariance[:, 3:6, 3:6] += turned_velocity_cov(states.velocity_ecef_mps, covariance[:, 3:6, 3:6])
         return Trajectory(

@@ -26,13 +26,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from flightmodel import earth, geomagnetism_and_sun, rotations
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import AttitudePrior, Finding, RestReadings, Telemetry, TriadRecord, mean_readings
+from flightmodel.checks import Check, FloatArray, GateError, Issue
+from flightmodel.telemetry import AttitudePrior, RestReadings, Telemetry, TriadRecord, mean_readings
 from recon._measurement_kernels import FIELD, VELOCITY
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.measurements import REST, Instrument, instrument_of
 
-_EVERY_S = 0.5  # of zero velocities: as first passes are thinned
 _LEVEL_SD_RAD = float(np.deg2rad(5.0))  # of the levelled prior, which zero velocities measure to a tenth of a degree
 _MOST_HEADING_RAD = float(np.deg2rad(30.0))  # beyond it linearisation fails
 _AGAIN = 3.0  # the Earth's rate is measured again in the filter: a ninth of its information counts twice
@@ -50,7 +48,7 @@ def rest_instruments(telemetry: Telemetry, start_s: float, point_ecef_m: FloatAr
     span = telemetry.start.at_rest
     if span is None or telemetry.rates is None:
         return ()
-    times = np.arange(max(span[0], start_s), span[1] + 1e-9, _EVERY_S)
+    times = np.arange(max(span[0], start_s), span[1] + 1e-9, 0.5)  # as first passes are thinned
     if not len(times):
         return ()
     latitude, longitude, _ = earth.geodetic_from_ecef(point_ecef_m)
@@ -142,7 +140,7 @@ def _heading(
     return seen, turning, float(_AGAIN * error / np.linalg.norm(turning[:2]))
 
 
-def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArray) -> list[ConsistencyCheck]:
+def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArray) -> list[Check]:
     """Mean specific force against gravity, mean rates against the Earth's, by the data sheets; none without a rest."""
 
     span = telemetry.start.at_rest
@@ -157,7 +155,7 @@ def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArra
         sd = np.sqrt(s.bias_sd**2 + s.bias_wander_sd**2 + (gravity * s.scale_sd) ** 2 + _mean_var(force, mean))
         symptom = f"at rest the accelerometer reads {size:.3f} m/s2 where gravity is {gravity:.3f}"
         out.append(
-            consistency_check(
+            Check.of(
                 "at-rest", "at rest accelerometer", abs(size - gravity) / sd, 0.0, most, symptom,
                 f"{symptom} ({100.0 * (size / gravity - 1.0):+.1f} %)", source=s.name, component="scale or bias",
                 advice="scale factor or bias exceed the data sheet: check units and calibration",
@@ -170,7 +168,7 @@ def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArra
         sd = np.sqrt(s.bias_sd**2 + s.bias_wander_sd**2 + _mean_var(rates, turn))
         symptom = f"at rest the gyros read {', '.join(f'{x:+.3g}' for x in np.rad2deg(turn.mean))} deg/s"
         out.append(
-            consistency_check(
+            Check.of(
                 "at-rest", "at rest gyros", float(beyond.max()) / sd, 0.0, most, symptom, symptom, source=s.name,
                 component="bias", advice=f"a bias of {beyond.max() / s.bias_sd:.0f} times the data sheet's, or no rest",
             )
@@ -178,7 +176,7 @@ def rest_checks(telemetry: Telemetry, confidence: float, point_ecef_m: FloatArra
     return out
 
 
-def inflated_priors(telemetry: Telemetry, checks: list[ConsistencyCheck], times: float) -> dict[str, float]:
+def inflated_priors(telemetry: Telemetry, checks: list[Check], times: float) -> dict[str, float]:
     """Standard deviations, ``times`` what was found, of the errors that failed checks at rest are about."""
     out: dict[str, float] = {}
     span = telemetry.start.at_rest
@@ -197,7 +195,7 @@ def inflated_priors(telemetry: Telemetry, checks: list[ConsistencyCheck], times:
     return out
 
 
-def noise_findings(telemetry: Telemetry) -> list[Finding]:
+def noise_findings(telemetry: Telemetry) -> list[Issue]:
     """Noise at rest where it differs from the data sheet's by more than half, as a proposal for it."""
     span, out = telemetry.start.at_rest, []
     if span is None:
@@ -211,5 +209,5 @@ def noise_findings(telemetry: Telemetry) -> list[Finding]:
         if not 1.0 / _NOISE_FACTOR < found / stated < _NOISE_FACTOR:
             words = f"noise at rest is {factor * found:.3g} {unit}, stated is {factor * stated:.3g}"
             words += ": proposed for the data sheet where the flight shakes no more"
-            out.append(Finding(record.spec.name, words, *span, code="noise-at-rest"))
+            out.append(Issue(words, "noise-at-rest", record.spec.name, *span))
     return out

@@ -5,92 +5,36 @@ The same names are the keys of ``[reconstruction]`` in flight.toml; `Settings.fr
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from functools import cache
+from typing import Annotated, Any, Literal, get_type_hints
 
-from flightmodel.checks import ConfigError, Fault, nearest_name
+from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictStr, TypeAdapter, ValidationError
+
+from flightmodel.checks import ConfigError, Issue, nearest_name
+from flightmodel.tables import ordered_spans
 
 COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.ekf` and `recon.smoother`
-_SYNONYMS = {"readable": FILTERPY}  # of an engine
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # whole ones too, but no text and no true or false
+Whole = Annotated[Number, Field(multiple_of=1.0), AfterValidator(int)]
+Rate = Annotated[Number, Field(ge=0.1, le=1000.0)]
+Zero = Annotated[Number, Field(ge=0.0, le=0.0)]
+Probability = Annotated[Number, Field(ge=0.5, lt=1.0)]
+Spans = Annotated[tuple[tuple[Number, Number], ...], AfterValidator(ordered_spans)]
+Engine = Annotated[
+    Literal["compiled", "filterpy"], BeforeValidator(lambda name: FILTERPY if name == "readable" else name)
+]
 
 
-def _setting(default: object, allowed: str, convert: Callable[[Any], object], code: str = "setting-range") -> Any:
-    """Declare a setting; ``convert`` gives the value as it is kept, or raises `ValueError` or `TypeError`."""
-    return field(default=default, metadata={"allowed": allowed, "convert": convert, "code": code})
+def _allowed(words: str, code: str = "value-range") -> dict[str, str]:
+    return {"allowed": words, "code": code}
 
 
-def _as_number(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise TypeError
-    return float(value)
-
-
-def _number(
-    default: float, low: float, high: float, also: float | None = None, below: bool = False, meaning: str = ""
-) -> Any:
-    """A number from ``low`` to ``high`` (``below`` it where asked), or ``also``, which means something special."""
-
-    def convert(value: Any) -> float:
-        number = _as_number(value)
-        if number != also and not (low <= number < high if below else low <= number <= high):
-            raise ValueError
-        return number
-
-    end = " (1 excluded)" if below else ""
-    return _setting(default, (f"{also:g} ({meaning}) or " if meaning else "") + f"{low:g} to {high:g}{end}", convert)
-
-
-def _integer(default: int, low: int, high: int, also: int | None = None, meaning: str = "") -> Any:
-    def convert(value: Any) -> int:
-        if isinstance(value, bool) or int(value) != value or (value != also and not low <= value <= high):
-            raise ValueError
-        return int(value)
-
-    return _setting(default, (f"{also} ({meaning}) or " if meaning else "") + f"{low} to {high}", convert)
-
-
-def _time() -> Any:
-    return _setting(None, "a time in s", lambda value: None if value is None else _as_number(value))
-
-
-def _flag(default: bool) -> Any:
-    def convert(value: Any) -> bool:
-        if not isinstance(value, bool):
-            raise TypeError
-        return value
-
-    return _setting(default, "true or false", convert)
-
-
-def _choice(default: str, known: tuple[str, ...], synonyms: Mapping[str, str] | None = None) -> Any:
-    def convert(value: Any) -> str:
-        name = (synonyms or {}).get(value, value) if isinstance(value, str) else ""
-        if name not in known:
-            raise ValueError(nearest_name(str(value), known))
-        return name
-
-    return _setting(default, f"one of {', '.join(known)}", convert, "setting-choice")
-
-
-def _names() -> Any:
-    def convert(value: Any) -> tuple[str, ...]:
-        if not isinstance(value, (list, tuple)) or not all(isinstance(name, str) for name in value):
-            raise TypeError
-        return tuple(value)
-
-    return _setting((), "a list of names", convert)
-
-
-def _spans() -> Any:
-    def convert(value: Any) -> tuple[tuple[float, float], ...]:
-        spans = tuple((_as_number(a), _as_number(b)) for a, b in value)
-        if not all(a < b for a, b in spans):
-            raise ValueError
-        return spans
-
-    return _setting((), "a list of spans [from, to] in s that end after they begin", convert)
+@cache
+def _rules() -> dict[str, TypeAdapter[Any]]:
+    """Types of the settings, as they are checked."""
+    return {name: TypeAdapter(kind) for name, kind in get_type_hints(Settings, include_extras=True).items()}
 
 
 @dataclass(frozen=True)
@@ -140,33 +84,39 @@ class Settings:
         With every value that is not allowed.
     """
 
-    output_rate_hz: float = _number(20.0, 0.1, 1000.0)
-    pulse_rate_hz: float = _number(0.0, 0.1, 1000.0, also=0.0, meaning="none")
-    start_s: float | None = _time()
-    end_s: float | None = _time()
-    carry_on_s: float = _number(0.0, 0.0, 1e5)
-    passes: int = _integer(3, 0, 10)
-    gate_probability: float = _number(0.9999, 0.5, 1.0, below=True)
-    check_confidence: float = _number(0.999, 0.5, 1.0, below=True)
-    angle_noise: str = _choice("traverse", ("traverse", "axis"))
-    consider: tuple[str, ...] = _names()
-    without: tuple[str, ...] = _names()
-    hold_out_every: int = _integer(0, 2, 1000, also=0, meaning="none")
-    hold_out_spans_s: tuple[tuple[float, float], ...] = _spans()
-    attitude_sensors: bool = _flag(False)
-    engine: str = _choice(COMPILED, ENGINES, _SYNONYMS)
+    output_rate_hz: Rate = field(default=20.0, metadata=_allowed("0.1 to 1000"))
+    pulse_rate_hz: Zero | Rate = field(default=0.0, metadata=_allowed("0 (none) or 0.1 to 1000"))
+    start_s: Number | None = field(default=None, metadata=_allowed("a time in s"))
+    end_s: Number | None = field(default=None, metadata=_allowed("a time in s"))
+    carry_on_s: Annotated[Number, Field(ge=0.0, le=1e5)] = field(default=0.0, metadata=_allowed("0 to 100000"))
+    passes: Annotated[Whole, Field(ge=0, le=10)] = field(default=3, metadata=_allowed("0 to 10"))
+    gate_probability: Probability = field(default=0.9999, metadata=_allowed("0.5 to 1 (1 excluded)"))
+    check_confidence: Probability = field(default=0.999, metadata=_allowed("0.5 to 1 (1 excluded)"))
+    angle_noise: Literal["traverse", "axis"] = field(
+        default="traverse", metadata=_allowed("one of traverse, axis", "value-range")
+    )
+    consider: tuple[StrictStr, ...] = field(default=(), metadata=_allowed("a list of names"))
+    without: tuple[StrictStr, ...] = field(default=(), metadata=_allowed("a list of names"))
+    hold_out_every: Annotated[Zero, AfterValidator(int)] | Annotated[Whole, Field(ge=2, le=1000)] = field(
+        default=0, metadata=_allowed("0 (none) or 2 to 1000")
+    )
+    hold_out_spans_s: Spans = field(
+        default=(), metadata=_allowed("a list of spans [from, to] in s that end after they begin")
+    )
+    attitude_sensors: StrictBool = field(default=False, metadata=_allowed("true or false"))
+    engine: Engine = field(default="compiled", metadata=_allowed(f"one of {', '.join(ENGINES)}", "value-range"))
 
     def __post_init__(self) -> None:
         """Check every value once."""
         faults = []
         for setting in fields(self):
-            value, rule = getattr(self, setting.name), setting.metadata
+            value, allowed = getattr(self, setting.name), setting.metadata["allowed"]
             try:
-                object.__setattr__(self, setting.name, rule["convert"](value))
-            except (TypeError, ValueError) as wrong:
-                shown = f"'{value}'" if isinstance(value, str) else f"{value}"
-                hint = str(wrong) if rule["code"] == "setting-choice" else ""
-                faults.append(Fault(f"{setting.name} {shown}{hint} must be {rule['allowed']}", rule["code"]))
+                object.__setattr__(self, setting.name, _rules()[setting.name].validate_python(value))
+            except ValidationError:
+                shown, code = f"'{value}'" if isinstance(value, str) else f"{value}", setting.metadata["code"]
+                known = allowed.removeprefix("one of ").split(", ") if code == "value-range" else ()
+                faults.append(Issue(f"{setting.name} {shown}{nearest_name(str(value), known)} must be {allowed}", code))
         if faults:
             raise ConfigError(faults)
 
@@ -181,9 +131,9 @@ class Settings:
         """
         names = [setting.name for setting in fields(cls)]
         faults = [
-            Fault(
+            Issue(
                 f"[reconstruction] {key}{nearest_name(key, names)}: no such setting; known: {', '.join(names)}",
-                "setting-unknown",
+                "name-unknown",
             )
             for key in values
             if key not in names
@@ -191,7 +141,7 @@ class Settings:
         try:
             chosen = cls(**{key: value for key, value in values.items() if key in names})  # type: ignore[arg-type]
         except ConfigError as wrong:
-            faults += [Fault(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
+            faults += [Issue(f"[reconstruction] {fault}", fault.code) for fault in wrong.faults]
         if faults:
             raise ConfigError(faults)
         return chosen

@@ -18,7 +18,7 @@ from types import MappingProxyType
 import numpy as np
 
 from flightmodel import geomagnetism_and_sun, rotations
-from flightmodel.checks import BoolArray, ConfigError, Fault, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, ConfigError, FloatArray, GateError, IntArray, Issue, nearest_name
 from flightmodel.earth import Planet
 from flightmodel.instruments import BAROMETER, GNSS, MAGNETOMETER, SITES, SitesSpec
 from flightmodel.instruments import RADAR as RADAR_ERRORS
@@ -59,18 +59,13 @@ Track = tuple[FloatArray, FloatArray]  # times (n,) and points (n, 3), ECEF m
 _TRACKING = (RADAR, POSITION, VELOCITY, HEIGHT, RANGE_RATE)
 # of means in which the pulse is found; half a g, below which nothing deflects
 _PULSE_CELL_S, _LEAST_PULSE_MPS2 = 0.5, 5.0
-_ATTITUDE_RATE_HZ = 10.0  # of magnetometer and Sun samples that become measurements
 _NO_POINTS: Mapping[str, FloatArray] = MappingProxyType({})
 _MOST_NODES = 2_000_000  # 28 h of a deceleration at 20 Hz, some 4 GB: an entry takes minutes
-_BALLISTIC_STEP_S = 0.5  # drivers are constant within a step, and decorrelate in seconds and kilometres
 _DIFFUSE_POSITION_M = 1000.0  # no information beside one point of any tracker
 _DIFFUSE_VELOCITY_MPS = 100.0  # the same, beside the line that is fitted
 _LEAST_POINTS = 4  # of a parabola, with one over
 _LEAST_SPAN_S = 2.0  # its later half gives a tracker of ten points a second the ten that residuals are tested with
 _TRACK_SPAN_S = 2.5  # a parabola at 10 m/s2 with a jerk of 3 m/s3 is off by 8 m: enough to linearise about
-_FIXED_RAD = 1e-6  # sd of the rotation of ballistic flight, which is held fixed
-_GYRO = slice(18, 27)
-_START_GAP_S = 0.1  # from a stated state to the sensors' first sample
 _LEAST_SURVEY_M, _LEAST_NORTH_RAD = 1e-3, 1e-9  # a millimetre, and at 1000 km too
 
 
@@ -117,7 +112,8 @@ def build_problem(
     if settings.attitude_sensors:
         instruments += _attitude_instruments(telemetry, track, start_s, end_s)
     inside = [i.time_s[(i.time_s >= start_s - 1e-9) & (i.time_s <= end_s + 1e-9)] for i in instruments]
-    between = np.arange(start_s, end_s, _BALLISTIC_STEP_S) if sensors is None else np.empty(0)
+    # drivers are constant within a step, and decorrelate in seconds and kilometres
+    between = np.arange(start_s, end_s, 0.5) if sensors is None else np.empty(0)
     time_s = _union([output_s, between, *inside])
     if sensors is None and len(time_s) > _MOST_NODES:
         raise GateError(
@@ -180,7 +176,7 @@ def _named_model(
     faults = _unknown_sources(telemetry, settings, trackers)
     if settings.attitude_sensors and sensors is None:
         remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
-        faults.append(Fault(remark, "setting-not-applicable"))
+        faults.append(Issue(remark, "keys-conflict"))
     model = _build_error_model(telemetry, sensors, settings.attitude_sensors)
     try:
         model = model.considering(settings.consider)
@@ -198,15 +194,13 @@ def check_sources(telemetry: Telemetry, settings: Settings) -> None:
         raise ConfigError(faults)
 
 
-def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[Instrument, ...]) -> list[Fault]:
+def _unknown_sources(telemetry: Telemetry, settings: Settings, trackers: tuple[Instrument, ...]) -> list[Issue]:
     known = sorted({name for i in trackers for name in (i.name, i.owner)})
     if settings.attitude_sensors:
         known += ["magnetometer"] if telemetry.magnetometer is not None else []
         known += [f"sun{k + 1}" for k in range(len(telemetry.sun.spec.clock_lv_rad))] if telemetry.sun else []
     return [
-        Fault(
-            f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "source-unknown"
-        )
+        Issue(f"source '{name}'{nearest_name(name, known)}: no such source; known: {', '.join(known)}", "name-unknown")
         for name in settings.without
         if name not in known
     ]
@@ -319,7 +313,7 @@ def _attitude_instruments(telemetry: Telemetry, track: Track, start_s: float, en
 def _thinned(time_s: FloatArray, good: BoolArray, start_s: float, end_s: float) -> IntArray:
     """Rows of the first good sample of each cell of time within a span."""
     rows = np.flatnonzero(good & (time_s >= start_s) & (time_s <= end_s))
-    _, first = np.unique(np.floor(time_s[rows] * _ATTITUDE_RATE_HZ), return_index=True)
+    _, first = np.unique(np.floor(time_s[rows] * 10.0), return_index=True)
     return rows[first]
 
 
@@ -381,7 +375,7 @@ def _span(
         raise GateError(
             "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
             "meet in one; a trajectory needs at least one",
-            code="no-track-points",
+            code="too-few-data",
         )
     else:
         start_s, end_s = float(t[0]), float(t[-1]) + settings.carry_on_s
@@ -398,7 +392,7 @@ def _span(
         raise GateError(
             f"inertial sensors and trackers share only {start_s:.3f} to {end_s:.3f} s; "
             f"at least {_LEAST_SPAN_S:g} s are needed: check time bases and the chosen span",
-            code="span-too-short",
+            code="time-not-covered",
         )
     return float(start_s), float(end_s)
 
@@ -410,10 +404,10 @@ def _check_reach(state_s: float, settings: Settings, sensors: InertialSensors | 
         words = f"the reconstruction is to begin at {settings.start_s:.3f} s; take start_s out"
     if sensors is not None:
         first = max(sensors.force.time_s[0], sensors.rate.time_s[0])
-        if first > state_s + _START_GAP_S:
+        if first > state_s + 0.1:
             words = f"accelerometer and gyros begin at {first:.3f} s; carry the state there, and its covariance"
     if words:
-        raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="start-out-of-reach")
+        raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="time-not-covered")
 
 
 def _normal_of_path(state: StatePrior) -> FloatArray:
@@ -478,13 +472,13 @@ def _start_attitude(
         raise GateError(
             f"attitude prior at {prior.time_s:.3f} s: gyro samples cover {rate.time_s[0]:.3f} to "
             f"{rate.time_s[-1]:.3f} s and cannot carry it to the start at {start_s:.3f} s",
-            code="attitude-prior-out-of-reach",
+            code="time-not-covered",
         )
     motion, ends = inertial_motion(force, rate, np.array([lo, hi]), planet=planet)
     first, last = (int(ends[0]), int(ends[1])) if prior.time_s < start_s else (int(ends[1]), int(ends[0]))
     anywhere = States(np.array([planet.semi_major_m, 0.0, 0.0]), np.zeros(3), q, np.zeros(model.size))
     step = propagate(motion, first, last, anywhere)
-    by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, _GYRO]
+    by_attitude, by_gyro = step.transition[6:9, 6:9], step.transition[6:9, 18:27]
     gyro_var = np.diag(model.prior_sd[9:18] ** 2)
     cross = by_gyro @ gyro_var
     total = by_attitude @ var @ by_attitude.T + cross @ by_gyro.T + step.noise[6:9, 6:9]
@@ -536,7 +530,7 @@ def fit_start(track: Track, start_s: float) -> tuple[FloatArray, FloatArray]:
     t, p = t[t >= start_s - FIT_SPAN_S] - start_s, p[t >= start_s - FIT_SPAN_S]
     if len(t) < 3:
         what = f"tracking: {len(t)} points after {start_s:.3f} s; at least 3 are needed to start"
-        raise GateError(what, code="too-few-track-points")
+        raise GateError(what, code="too-few-data")
     near = int(np.searchsorted(t, FIT_SPAN_S))
     count = near if near >= 2 else _LEAST_POINTS
     t, p = t[:count], p[:count]
@@ -659,5 +653,5 @@ def _start_ballistic(
         covariance[:6, :6] = stated.covariance
     else:
         position, velocity = fit_start(track, start_s)
-    covariance[range(6, 9), range(6, 9)] = _FIXED_RAD**2
+    covariance[range(6, 9), range(6, 9)] = 1e-6**2  # rotation is held fixed
     return States(position, velocity, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(model.size)), covariance

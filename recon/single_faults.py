@@ -34,7 +34,6 @@ WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some ten
 _NOISIER = 10.0  # times the stated noise: of a sensor of another grade, or a loose connector
 _G, _DEGREE = earth.STANDARD_GRAVITY_MPS2, np.pi / 180.0
 _UNIT_SLIPS = {"accelerometer": (_G, 1.0 / _G), "rates": (_DEGREE, 1.0 / _DEGREE)}
-_REFRACTION_SD = 1.0  # of the whole correction
 _SERVO_HZ, _SERVO_LAG_SD = 0.5, 3.0  # the lag goes with 1 / Hz^2: from none to that of a quarter of a hertz within 1 sd
 _PRIOR_SD_RAD = np.deg2rad(30.0)  # a linear filter converges from so far; starts a quarter turn apart reach everything
 _LEAST_GAIN = np.log(100.0)  # over the flight as stated, of which a check has failed already
@@ -180,7 +179,7 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
         out.append(Single("tracker", f"{name}: noise", (name,), telemetry, noisier={name: _NOISIER}))
     if telemetry.radars:
         names = tuple(telemetry.radars)
-        bent = _with_sites(telemetry, lambda site: replace(site, refraction_sd=_REFRACTION_SD))
+        bent = _with_sites(telemetry, lambda site: replace(site, refraction_sd=1.0))
         slow = _with_sites(telemetry, _slower)
         out.append(Single("refraction", "refraction of the radars", names, bent))
         out.append(Single("servo-lag", "servo of the radars", names, slow))

@@ -36,15 +36,13 @@ Automatic Control 14 (1969) 387.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from flightmodel.checks import DivergenceError, FloatArray, IntArray
+from flightmodel.checks import BoolArray, DivergenceError, FloatArray, IntArray
 from recon import _filter_kernels
-from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps
-from recon.settings import COMPILED
+from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps, full_step, measured_rows
 from recon.state import KINEMATIC, States, boxplus, packed, unpacked
 
 
@@ -70,7 +68,7 @@ class Smoothed:
         return boxplus(charts, self.x)
 
 
-def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True, engine: str = COMPILED) -> Smoothed:
+def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True) -> Smoothed:
     """Smooth a forward pass; without covariance where only a reference trajectory is wanted.
 
     Where errors are only considered this is `two_filter`, which exists in numpy alone.
@@ -81,57 +79,38 @@ def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True, eng
         Where readings are so far from the flight that what `two_filter` factors is no longer positive definite.
     """
     kept = int(problem.kept.sum()) if with_covariance else 0
-    triangles, variance = np.empty((kept, problem.dense * (problem.dense + 1) // 2)), np.empty((kept, problem.size))
+    return _smoothed(problem, run.steps, run.filtered, run.innovations, kept)
+
+
+def smoothed_covariance(problem: Problem, run: ForwardPass, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Smoothed errors at all nodes (n, N) and their whole covariance at the kept ones (k, N, N)."""
+    count = int(kept.sum())
+    rows: IntArray = np.full(len(kept), -1, dtype=np.int64)
+    rows[kept] = np.arange(count)
+    phi = run.steps.transition
+    # covariance is kept of errors that the motion depends on: of all, where all are columns
+    wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
+    steps, filtered = run.steps._replace(transition=wide), run.filtered._replace(kept=rows)
+    made = _smoothed(problem, steps, filtered, run.innovations, count)
+    return made.x, unpacked(made.triangles)
+
+
+def _smoothed(problem: Problem, steps: Steps, filtered: Filtered, innovations: Innovations, kept: int) -> Smoothed:
+    """Smoothed errors, with moments of as many nodes as are ``kept``; of none where that is 0."""
+    dense = steps.transition.shape[2]
+    triangles, variance = np.empty((kept, dense * (dense + 1) // 2)), np.empty((kept, problem.size))
     considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
-    if len(considered):
-        x = run.filtered.x_minus.copy()
-        try:
-            two_filter(
-                run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, considered, x,
-                triangles, variance,
-            )  # fmt: skip
-        except np.linalg.LinAlgError:
-            words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
-            raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
-    else:
-        x = run.filtered.x_plus.copy()
-        backward(engine)(run.steps, run.filtered, problem.moving, x, triangles, variance)
+    if not len(considered):
+        x = filtered.x_plus.copy()
+        _filter_kernels.rauch_tung_striebel(steps, filtered, problem.moving, x, triangles, variance)
+        return Smoothed(x, triangles, variance)
+    x, slots = filtered.x_minus.copy(), problem.sources().slot
+    try:
+        two_filter(steps, filtered, problem.observed, slots, innovations, considered, x, triangles, variance)
+    except np.linalg.LinAlgError:
+        words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
+        raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
     return Smoothed(x, triangles, variance)
-
-
-def backward(engine: str) -> Callable[..., None]:
-    """Rauch-Tung-Striebel's pass of an engine: arguments as `rauch_tung_striebel`."""
-    return _filter_kernels.rauch_tung_striebel if engine == COMPILED else rauch_tung_striebel
-
-
-def step_gain(
-    transition: FloatArray, noise: FloatArray, p_next: FloatArray, moving: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Rows of the smoother's gain ``(d, N)`` and added covariance ``(d, d)`` of the moving errors in one step.
-
-    Parameters
-    ----------
-    transition : (d, N) float
-        Rows of the moving errors; all other rows are unit rows.
-    noise : (d, d) float
-        Noise of the moving errors.
-    p_next : (N, N) float
-        Filter covariance predicted for the later node.
-    moving : (d,) int
-        Errors that change or are driven by noise.
-    """
-    size = len(p_next)
-    scale = np.sqrt(np.diag(p_next))
-    columns = np.zeros((size, len(moving)))
-    columns[moving] = noise
-    solved = np.linalg.solve(p_next / np.outer(scale, scale), columns / scale[:, None]) / scale[:, None]  # P^-1 Q
-    rest = noise - noise @ solved[moving]
-    inverse = np.linalg.inv(transition[:, moving])
-    gain = -solved.T  # rows of 1 - Q P^-1, less what constants carry into moving errors
-    gain[np.arange(len(moving)), moving] += 1.0
-    constant = np.setdiff1d(np.arange(size), moving)
-    gain[:, constant] -= transition[:, constant]
-    return inverse @ gain, inverse @ rest @ inverse.T
 
 
 def store_moments(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, variance: FloatArray) -> None:
@@ -140,53 +119,6 @@ def store_moments(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, v
     if row >= 0 and len(triangles):
         dense = int(np.sqrt(2 * triangles.shape[1]))
         triangles[row], variance[row] = packed(p[:dense, :dense]), np.diag(p)
-
-
-def full_step(steps: Steps, k: int) -> tuple[FloatArray, FloatArray]:
-    """Whole transition and noise (N, N) of a step from its blocks."""
-    decay, noise_var = steps.decay[k], steps.noise_var[k]
-    f = np.diag(np.concatenate([np.ones(KINEMATIC), decay]))
-    q = np.diag(np.concatenate([np.zeros(KINEMATIC), noise_var]))
-    phi = steps.transition[k]
-    f[:KINEMATIC, : phi.shape[1]] = phi
-    q[:KINEMATIC, :KINEMATIC] = steps.noise[k]
-    return f, q
-
-
-def rauch_tung_striebel(
-    steps: Steps, run: Filtered, moving: IntArray, x: FloatArray, triangles: FloatArray, variance: FloatArray
-) -> None:
-    """Smooth ``x`` (n, N), which comes as the filtered errors, in place; moments at kept nodes where wanted."""
-    p = run.p_last.copy()
-    store_moments(run, len(x) - 1, p, triangles, variance)
-    for k in reversed(range(len(x) - 1)):
-        f, q = full_step(steps, k)
-        prior = unpacked(run.p_minus[k + 1])
-        c, added = step_gain(f[moving], q[np.ix_(moving, moving)], prior, moving)
-        step = x[k + 1] - run.x_minus[k + 1]
-        x[k] += step
-        x[k, moving] += c @ step - step[moving]
-        rows = c @ p
-        p[moving], p[:, moving] = rows, rows.T
-        block = rows @ c.T + added
-        p[np.ix_(moving, moving)] = 0.5 * (block + block.T)
-        store_moments(run, k, p, triangles, variance)
-
-
-def jacobian(innovations: Innovations, slot: IntArray, row: int, size: int) -> FloatArray:
-    """Partials (3, N) of one measurement's prediction by all errors; ``slot`` (SLOTS,) of its instrument."""
-    h = np.zeros((3, size))
-    h[:, :KINEMATIC] = innovations.by_state[row]
-    h[:, KINEMATIC + slot[slot >= 0]] += innovations.by_error[row][:, slot >= 0]
-    return h
-
-
-def measured_rows(
-    observed: Observed, slots: IntArray, innovations: Innovations, row: int, size: int
-) -> tuple[IntArray, FloatArray]:
-    """Components (k,) that a measurement has, and their partials by all errors (k, N)."""
-    used = np.flatnonzero(np.isfinite(observed.variance[row]))
-    return used, jacobian(innovations, slots[observed.source[row]], row, size)[used]
 
 
 def _root(covariance: FloatArray) -> FloatArray:

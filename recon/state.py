@@ -103,16 +103,6 @@ def boxminus(states: States, reference: States) -> FloatArray:
     )
 
 
-def stack(states: list[States]) -> States:
-    """States of single nodes as one with a leading axis."""
-    return States(
-        np.array([s.position_ecef_m for s in states]),
-        np.array([s.velocity_ecef_mps for s in states]),
-        rotations.continuous(np.array([s.q_ecef_body for s in states])),
-        np.array([s.sensor_errors for s in states]),
-    )
-
-
 def right_jacobian(rotation_rad: FloatArray) -> FloatArray:
     """Matrix (3, 3) from a change of a rotation vector to the body-axis rotation it causes; second order."""
     k = rotations.skew(rotation_rad)
@@ -235,7 +225,7 @@ class ErrorModel:
             if not any(_fits(b, [name]) for b in self.blocks)
         ]
         if faults:
-            raise GateError(faults, code="error-unknown")
+            raise GateError(faults, code="name-unknown")
         return ErrorModel(blocks)
 
 

@@ -23,14 +23,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel import earth, rotations
-from flightmodel.checks import FloatArray
+from flightmodel.checks import Check, FloatArray, Issue
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import Finding, KnownPlace, Telemetry
+from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
-from recon.consistency import ConsistencyCheck, consistency_check, smoothed_covariance
 from recon.ekf import ForwardPass, Problem
 from recon.measurements import SITES
 from recon.settings import Settings
+from recon.smoother import smoothed_covariance
 from recon.state import KINEMATIC, States
 
 _UNITS = {"m": ("m", 1.0), "rad": ("deg", float(np.rad2deg(1.0)))}
@@ -70,7 +70,6 @@ def missed_places(
     states: States,
     arm_body_m: FloatArray,
     places: tuple[KnownPlace, ...],
-    settings: Settings,
 ) -> list[Miss]:
     """By how much a trajectory misses places that are known.
 
@@ -83,7 +82,6 @@ def missed_places(
         Accelerometer from the datum, which is what was at the places.
     places : tuple of KnownPlace
         A time outside the trajectory is compared with its nearer end, less well by the way flown in between.
-    settings : Settings
     """
     if not places:
         return []
@@ -91,7 +89,7 @@ def missed_places(
     nodes = nearest_index(problem.time_s, np.array([place.time_s for place in places]))
     kept = np.zeros(len(problem.time_s), dtype=bool)
     kept[nodes] = True
-    _, covariances = smoothed_covariance(problem, run, kept, settings.engine)
+    _, covariances = smoothed_covariance(problem, run, kept)
     columns = {name: problem.model.column(SITES, name) for single in _HYPOTHESES[:4] for name in single}
     out = []
     for place, node in zip(places, nodes.tolist(), strict=True):
@@ -113,7 +111,7 @@ def missed_places(
     return out
 
 
-def place_checks(misses: list[Miss], confidence: float, tracked: bool = True) -> list[ConsistencyCheck]:
+def place_checks(misses: list[Miss], confidence: float, tracked: bool = True) -> list[Check]:
     """One check for each place that is known; one that fails names the error of all sites that would explain it.
 
     Without a tracker (``tracked``) it is the stated state, or what was integrated from it.
@@ -125,7 +123,7 @@ def place_checks(misses: list[Miss], confidence: float, tracked: bool = True) ->
         symptom = f"the trajectory passes {away:.3g} m from it"
         most = chi_square_quantile(confidence, len(miss.residual_m))
         good = f"{symptom}, within the uncertainty of both"
-        check = consistency_check(
+        check = Check.of(
             "place", f"place {miss.place.name}", miss.chi2, 0.0, most, good, symptom, advice=causes,
             source=SITES if tracked else "start",
             component=component,
@@ -165,7 +163,7 @@ def _amount(name: str, size: float) -> str:
     return f"{name} {factor * size:+.3g} {unit}"
 
 
-def shared_error_check(table: FloatArray, names: list[str], consistent: bool) -> ConsistencyCheck | None:
+def shared_error_check(table: FloatArray, names: list[str], consistent: bool) -> Check | None:
     """Check that fails where common errors of the sites, with wide priors, make all data consistent.
 
     Parameters
@@ -183,7 +181,7 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
         return None
     component = names[worst].removeprefix(f"{SITES} ")
     words = _amount(component, float(table[worst, 0]))
-    return consistency_check(
+    return Check.of(
         "sites", "radar sites", float(away[worst]), 0.0, 3.0, "",
         f"an error of all radar sites together makes all data consistent: stated minus true, {words}",
         advice="check survey, height datum and azimuth mark, against the receiver or barometer that differs",
@@ -191,13 +189,13 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
     )  # fmt: skip
 
 
-def unchecked_state(telemetry: Telemetry) -> list[Finding]:
+def unchecked_state(telemetry: Telemetry) -> list[Issue]:
     """Finding where a flight without a tracker states no place: then nothing checks where it flew."""
     state = telemetry.start.state
     if state is None or telemetry.radars or telemetry.gnss or telemetry.places:
         return []
     words = "no tracker and no [[places]]: nothing checks this state, its time and axes; state where the vehicle landed"
-    return [Finding("start", words, state.time_s, state.time_s, "state-unchecked")]
+    return [Issue(words, "state-unchecked", "start", state.time_s, state.time_s)]
 
 
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:

@@ -28,11 +28,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, Check, FloatArray, Issue
 from flightmodel.statistics import NORMAL_MAD
-from flightmodel.telemetry import Finding, TriadRecord
+from flightmodel.telemetry import TriadRecord
 from flightmodel.trajectory import interpolate_rows
-from recon.consistency import ConsistencyCheck, consistency_check
 from recon.ekf import ForwardPass, Problem
 from recon.fault_detection import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.imu_screening import BridgedSensor, usual_steps
@@ -41,7 +40,6 @@ from recon.state import KINEMATIC, States
 _WINDOW_S, _STEP_S = 4.0, 0.01  # some periods of the oscillation; a fortieth of one at 2.5 Hz
 _SMOOTH_S, SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
 _LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01  # a fifth of a period at 2.5 Hz: a longer one is found by `recon.oscillation`
-_LARGEST_SD_S = _LONGEST_LAG_S / 10.0  # else hardly any lag in the range would be significant
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square
 CORRELATION_S = 0.7  # of residuals
 _LEAST_WINDOWS = 4  # so that their scatter says how well the lag is known
@@ -89,7 +87,8 @@ def lag_between(
         both = (_lag_in_window(interpolate_rows(at, ft, f)[:, i], shifted, lags, i) for i in (1, 2))
         lags_found += [(*one, damping) for one in both if one is not None]
     lag = _combined(np.array(lags_found)) if len(lags_found) >= _LEAST_WINDOWS else None
-    return lag if lag is not None and lag.sd_s < _LARGEST_SD_S else None
+    # else hardly any lag in the range would be significant
+    return lag if lag is not None and lag.sd_s < _LONGEST_LAG_S / 10.0 else None
 
 
 def smoothed_body_axes(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
@@ -145,7 +144,7 @@ def _combined(lags: FloatArray) -> Lag:
     return Lag(middle, float(np.hypot(1.25 * scatter / np.sqrt(weight.sum()), common)))
 
 
-def lag_check(lag: Lag, force: BridgedSensor, rate: BridgedSensor, confidence: float) -> ConsistencyCheck:
+def lag_check(lag: Lag, force: BridgedSensor, rate: BridgedSensor, confidence: float) -> Check:
     """Whether the lag is consistent with the time biases that both data sheets state."""
 
     allowed = float(np.hypot(force.spec.time_bias_sd_s, rate.spec.time_bias_sd_s))
@@ -154,7 +153,7 @@ def lag_check(lag: Lag, force: BridgedSensor, rate: BridgedSensor, confidence: f
     verb = "lag" if lag.lag_s > 0.0 else "lead"
     symptom = f"{force.spec.name} time tags {verb} those of {rate.spec.name} by {1e3 * abs(lag.lag_s):.1f} ± "
     symptom += f"{1e3 * lag.sd_s:.1f} ms"
-    return consistency_check(
+    return Check.of(
         "clock-lag", f"clocks of {names}", lag.lag_s / np.hypot(lag.sd_s, allowed), -limit, limit, symptom, symptom,
         advice="more than their data sheets state: check both time bases",
         component="time bias",
@@ -223,14 +222,14 @@ def with_corrected_tags(record: TriadRecord, sensor: int, jumps: tuple[ClockJump
     return replace(record, time_s=t)
 
 
-def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Finding]:
+def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Issue]:
     """One finding for each sensor and jump."""
     out = []
     for jump in jumps:
         remark = f"time tags jump {1e3 * jump.by_s:.1f} ms ahead while no sample is missing: those "
         remark += "after it were set back" if jump.after else "before it were set forward"
         span = jump.at_s - 0.5 * jump.by_s, jump.at_s + 0.5 * jump.by_s
-        out += [Finding(names[sensor], remark, *span, "clock-jump") for sensor in jump.sensors]
+        out += [Issue(remark, "clock-jump", names[sensor], *span) for sensor in jump.sensors]
     return out
 
 

@@ -9,7 +9,7 @@ over that of noise of the stated size, so that a point more or less hardly count
 
 Where no other fault explains the flight better, it is reconstructed with the tags set back, and that stands where no
 check of it fails. So it is where nothing is explained by any fault and the error state itself is large. The check
-`tracker-time` judges the lag by what is stated.
+`clock-corrected` judges the lag by what is stated.
 """
 
 from __future__ import annotations
@@ -22,16 +22,14 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.telemetry import Finding, Telemetry
-from recon.consistency import ConsistencyCheck, consistency_check
+from flightmodel.checks import Check, FloatArray, GateError, Issue
+from flightmodel.telemetry import Telemetry
 from recon.ekf import ForwardPass, Problem
 from recon.single_faults import Single, SingleFault, log_likelihood
 from recon.state import States
 
 _STEP_S, _FARTHEST_S = 1.0, 10.0  # of a climb; the filter finds the way from as far
 _WIDE_S = 0.5  # a priori sd of what a shift leaves
-_NEAR_S, _MOST_STEPS = 0.02, 4  # the path's curvature over it is nothing
 _LEAST_GAIN = 1.0  # of log likelihood, that a step is taken
 _LEAST_LAG_S = 0.1  # below it the error state serves, with a wider prior
 _LARGE_S, _KNOWN_SD = 0.25, 5.0  # from here on third order counts; an estimate that is not its prior's
@@ -85,8 +83,8 @@ def _climbed(tried: Callable[[float], _Tried | None]) -> _Tried | None:
             if other is None or other.gain <= best.gain + _LEAST_GAIN:
                 break
             best = other
-    for _ in range(_MOST_STEPS):
-        if best is None or abs(best.rest_s) < _NEAR_S:
+    for _ in range(4):
+        if best is None or abs(best.rest_s) < 0.02:  # over which the path is straight
             break
         other = tried(best.late_s + best.rest_s)
         if other is None or other.gain < best.gain - _LEAST_GAIN:
@@ -131,7 +129,7 @@ def lags(telemetry: Telemetry, faults: tuple[SingleFault, ...], sensor_errors: p
 
 def judged_by_the_stated(
     telemetry: Telemetry, late_s: Mapping[str, float], sensor_errors: pd.DataFrame, confidence: float
-) -> tuple[list[ConsistencyCheck], list[Finding], pd.DataFrame]:
+) -> tuple[list[Check], list[Issue], pd.DataFrame]:
     """Checks and findings of the tags that were set back, and errors of the tags as delivered."""
     checks, findings, table = [], [], sensor_errors.set_index("name")
     limit = float(ndtri(0.5 * (1.0 + confidence)))
@@ -140,13 +138,13 @@ def judged_by_the_stated(
         whole_s, sd_s = moved_s + float(table.estimate[error]), float(table.sd[error])
         stated_s = record.spec.time_bias_sd_s
         symptom = f"{name}: time tags {_in_words(whole_s)} ± {sd_s:.3f}, set right"
-        made = consistency_check(
-            "tracker-time", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
+        made = Check.of(
+            "clock-corrected", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
             advice=f"more than stated (time_bias_sd_s = {stated_s:g}); or the inertial sensors' tags, and with them "
             "the trajectory's, are off as much the other way: check both", source=name, component="time bias",
         )  # fmt: skip
         checks.append(made)
-        findings.append(Finding(name, symptom, float(record.time_s[0]), float(record.time_s[-1]), "clock-corrected"))
+        findings.append(Issue(symptom, "clock-corrected", name, float(record.time_s[0]), float(record.time_s[-1])))
         table.loc[error, ["prior_sd", "estimate"]] = stated_s, whole_s
     return checks, findings, table.reset_index()
 

@@ -19,9 +19,7 @@ from flightmodel.checks import FloatArray
 from recon._measurement_kernels import RADAR
 from recon.measurements import Instrument, sight, sight_partials, wrapped
 
-_CELL_S = 0.5  # one point in each: a start needs no more
 _BRIDGED_S = 3.0  # over which a parabola's chord is off by some tens of metres at 10 m/s2: enough to linearise about
-_ITERATIONS = 50  # a bound, for Gauss-Newton from far
 _WORST_SD_M = 5e3  # of a point: beyond it the filter would linearise far from the path
 
 
@@ -30,7 +28,7 @@ def triangulated(sites: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]
     if len(sites) < 2:
         return np.empty(0), np.empty((0, 3))
     t = np.unique(np.concatenate([site.time_s for site in sites]))
-    t = t[np.unique(np.floor(t / _CELL_S), return_index=True)[1]]
+    t = t[np.unique(np.floor(t / 0.5), return_index=True)[1]]
     readings = np.array([_at(site, t) for site in sites])  # (sites, n, 3)
     weights = np.array([_weights(site) for site in sites])
     enough = np.isfinite(readings).sum(axis=(0, 2)) >= 3
@@ -74,7 +72,7 @@ def _point(
     """Least-squares point (3,) of readings (sites, 3), and whether it is well fixed."""
     at = _first_guess(sites, readings) if before is None else before
     damping, (cost, step, normal) = 1e-3, _normal(sites, readings, weights, at)
-    for _ in range(_ITERATIONS):
+    for _ in range(50):
         move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), step)
         tried = _normal(sites, readings, weights, at + move)
         if tried[0] < cost:

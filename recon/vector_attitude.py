@@ -25,9 +25,9 @@ import pandas as pd
 from scipy.special import ndtri
 
 from flightmodel import earth, rotations
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, IntArray, Issue
 from flightmodel.statistics import chi_square_quantile
-from flightmodel.telemetry import AttitudePrior, Finding, SunRecord, Telemetry, TriadRecord
+from flightmodel.telemetry import AttitudePrior, SunRecord, Telemetry, TriadRecord
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from recon.attitude_smoother import (
     ErrorTerms,
@@ -43,9 +43,8 @@ from recon.attitude_smoother import (
     solve_vectors,
     unit,
 )
-from recon.consistency import ConsistencyCheck, consistency_check, data_sheet_check
+from recon.consistency import data_sheet_check
 
-_QUARTER_RAD = 0.5 * np.pi
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
 _START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude and rate follow within seconds
 _TRACK_BLOCK_S = 1.0  # a block a second carries what a velocity's direction says of the attitude
@@ -90,8 +89,8 @@ class AttitudeHistory:
     rate_body_radps : (n, 3) float
         Of the body against inertial space, body axes.
     method : str
-    findings : tuple of Finding
-    consistency_checks : tuple of ConsistencyCheck
+    findings : tuple of Issue
+    consistency_checks : tuple of Check
         Residuals and constant errors of each sensor against its data sheet.
     sensor_errors : DataFrame
         ``name, unit, prior_sd, estimate, sd`` (SI).
@@ -104,8 +103,8 @@ class AttitudeHistory:
     covariance: FloatArray
     rate_body_radps: FloatArray
     method: str
-    findings: tuple[Finding, ...]
-    consistency_checks: tuple[ConsistencyCheck, ...]
+    findings: tuple[Issue, ...]
+    consistency_checks: tuple[Check, ...]
     sensor_errors: pd.DataFrame
     observations: tuple[VectorObservations, ...]
 
@@ -142,7 +141,7 @@ def reconstruct_attitude(
         raise GateError(
             f"flight '{telemetry.name}': magnetometer, Sun sensors and position share {start_s:.3f} to {end_s:.3f} s, "
             "too little for an attitude; check their time bases",
-            code="span-too-short",
+            code="time-not-covered",
         )
     knots_s = np.arange(first, last + 1.0) / settings.rate_hz
     terms = error_terms(magnetometer.spec, sun.spec, settings.unstated, float(knots_s[0]), float(knots_s[-1]))
@@ -170,7 +169,7 @@ def _required_vectors(telemetry: Telemetry) -> tuple[TriadRecord, SunRecord]:
         if record is None
     ]
     if faults or telemetry.magnetometer is None or telemetry.sun is None:
-        raise GateError(faults, code="vector-sensors-missing")
+        raise GateError(faults, code="input-missing")
     return telemetry.magnetometer, telemetry.sun
 
 
@@ -185,7 +184,7 @@ def _place(
     time_s, points = position
     if len(time_s) == 0 or not np.isfinite(points).all():
         what = f"flight '{telemetry.name}': position is empty or not finite; the field needs a position"
-        raise GateError(what, code="position-missing")
+        raise GateError(what, code="input-missing")
     return lambda at: interpolate_rows(at, time_s, points), [(float(time_s[0]), float(time_s[-1]))]
 
 
@@ -198,7 +197,7 @@ def track(telemetry: Telemetry) -> tuple[FloatArray, FloatArray]:
     whole = np.isfinite(p).all(axis=1)
     if not whole.any():
         what = f"flight '{telemetry.name}': no radar point and no fix locates the vehicle in the Earth's field"
-        raise GateError(what, code="no-track-points")
+        raise GateError(what, code="too-few-data")
     block = np.floor(t[whole] / _TRACK_BLOCK_S)
     table = pd.DataFrame(np.column_stack([t, p])[whole]).groupby(block).median().to_numpy(copy=True)
     # within a block the vehicle moves by less than changes the field
@@ -225,18 +224,16 @@ def _solve_each(name: str, observations: list[VectorObservations], count: int) -
             if len(both)
             else "no head sees the Sun while the magnetometer measures"
         )
-        raise GateError(f"flight '{name}': no attitude from directions: {why}", code="attitude-not-observable")
+        raise GateError(f"flight '{name}': no attitude from directions: {why}", code="not-observable")
     return both[sharp], rotations.continuous(q[sharp])
 
 
-def _bridged(
-    knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings
-) -> tuple[BoolArray, list[Finding]]:
+def _bridged(knots_s: FloatArray, solved: IntArray, q: FloatArray, settings: Settings) -> tuple[BoolArray, list[Issue]]:
     """Knots to solve at: between those with an attitude, less gaps too long to be bridged, which are findings."""
     step = np.diff(knots_s[solved])
     rotated = np.linalg.norm(rotations.boxminus(q[1:], q[:-1]), axis=1)
     rate = float(np.median(rotated / step)) if len(step) else 0.0
-    longest = min(settings.longest_gap_s, _QUARTER_RAD / max(rate, 1e-9))
+    longest = min(settings.longest_gap_s, 0.5 * np.pi / max(rate, 1e-9))
     keep = np.zeros(len(knots_s), dtype=bool)
     keep[solved[0] : solved[-1] + 1] = True
     found = []
@@ -244,7 +241,7 @@ def _bridged(
         keep[solved[k] + 1 : solved[k + 1]] = False
         remark = f"no attitude for {step[k]:.1f} s: field or Sun missing, and up to {longest:.1f} s can be bridged"
         span = float(knots_s[solved[k]]), float(knots_s[solved[k + 1]])
-        found.append(Finding("attitude check", remark, *span, "attitude-gap"))
+        found.append(Issue(remark, "too-few-data", "attitude check", *span))
     return keep, found
 
 
@@ -255,23 +252,21 @@ def _renumbered(observed: VectorObservations, keep: BoolArray) -> VectorObservat
 
 def _fit_findings(
     fit: Fit, before: list[VectorObservations], after: list[VectorObservations], knots: Knots
-) -> list[Finding]:
+) -> list[Issue]:
     ends = float(knots.time_s[0]), float(knots.time_s[-1])
     kept = {observed.name: len(observed.knot) for observed in after}
     found = [
-        Finding(
-            observed.name,
+        Issue(
             f"{len(observed.knot) - kept[observed.name]} blocks edited from the attitude check",
+            "points-edited",
+            observed.name,
             *ends,
-            "blocks-edited",
         )
         for observed in before
         if len(observed.knot) > kept.get(observed.name, len(observed.knot))
     ]
     if not fit.converged:
-        found.append(
-            Finding("attitude check", f"not converged after {fit.steps} steps", *ends, "attitude-not-converged")
-        )
+        found.append(Issue(f"not converged after {fit.steps} steps", "not-converged", "attitude check", *ends))
     return found
 
 
@@ -280,7 +275,7 @@ def _history(
     fit: Fit,
     terms: ErrorTerms,
     used: list[VectorObservations],
-    findings: list[Finding],
+    findings: list[Issue],
     settings: Settings,
 ) -> AttitudeHistory:
     sd = np.sqrt(np.diagonal(fit.error_covariance))
@@ -300,26 +295,21 @@ def _history(
     )
 
 
-def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[ConsistencyCheck]:
+def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[Check]:
     """Of each sensor its residuals, and its constant errors against its data sheet."""
 
-    out: list[ConsistencyCheck] = []
+    out: list[Check] = []
     tail = 0.5 * (1.0 - confidence)
     for name, (squares, expected) in fit.misfit.items():
         low, high = (chi_square_quantile(p, expected) / expected for p in (tail, 1.0 - tail))
         out.append(
-            consistency_check(
-                "attitude-residuals",
-                f"residuals {name}",
-                squares / expected,
-                float(low) - _MISFIT_ALLOWANCE,
-                float(high) + _MISFIT_ALLOWANCE,
-                f"{name}: residuals as large as its noise",
+            Check.of(
+                "attitude-residuals", f"residuals {name}", squares / expected, float(low) - _MISFIT_ALLOWANCE,
+                float(high) + _MISFIT_ALLOWANCE, f"{name}: residuals as large as its noise",
                 f"{name}: residuals are not as large as its noise",
-                advice="check noise, clocking and interference",
-                source=name,
+                advice="check noise, clocking and interference", source=name,
             )
-        )
+        )  # fmt: skip
     sd = np.sqrt(np.diagonal(fit.error_covariance))
     for name in dict.fromkeys(terms.instruments):
         own = terms.of(name)
@@ -382,7 +372,7 @@ def compare(history: AttitudeHistory, trajectory: Trajectory, confidence: float 
         raise GateError(
             f"attitude check: the history's {t[0]:.3f} to {t[-1]:.3f} s lie outside the trajectory's "
             f"{trajectory.time_s[0]:.3f} to {trajectory.time_s[-1]:.3f} s",
-            code="no-common-span",
+            code="time-not-covered",
         )
     other = resample(trajectory, t[rows])
     off = rotations.boxminus(history.q_ecef_body[rows], other.q_ecef_body)
@@ -468,7 +458,7 @@ def start_attitude_from_vectors(telemetry: Telemetry, around_s: float) -> Attitu
             f"flight '{telemetry.name}': no attitude from directions at {around_s:.3f} s: magnetometer covers "
             f"{magnetometer.time_s[0]:.3f} to {magnetometer.time_s[-1]:.3f} s, Sun sensors {sun.time_s[0]:.3f} to "
             f"{sun.time_s[-1]:.3f} s",
-            code="no-common-span",
+            code="time-not-covered",
         )
     part = replace(
         telemetry,

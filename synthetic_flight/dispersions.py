@@ -8,23 +8,24 @@ worker or a thousand, and one factor more or less leaves the others' numbers as 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 from scipy.special import ndtri
 
 from flightmodel.atmosphere import AtmosphereProfile
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.config import KeyFaults, NonNegative, Section, Time
+from flightmodel.config import KeyFault, NonNegative, Section, Time
+from flightmodel.instruments import with_keys
 from flightmodel.vehicle import CompliantJoint, MassProperties, Vehicle
 from synthetic_flight.instrument_errors import name_key
 from synthetic_flight.scenarios import Initial, Scenario
 from synthetic_flight.weather import day_of_flight_atmosphere
 
-SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
+_SMALLEST = 2.0**-54  # a draw of exactly zero would be an infinite deviation
 WIND_FADE_M = (110e3, 130e3)
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 T = TypeVar("T", bound=Section)
@@ -36,15 +37,14 @@ class Shift(Section):
     normal: NonNegative | None = None
     uniform: tuple[Number, Number] | None = None
 
-    @model_validator(mode="after")
-    def _one(self) -> Shift:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
             names = ", ".join(type(self).model_fields)
-            raise ValueError(f"exactly one of {names} is wanted; got {', '.join(given) or 'none'}")
-        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
-            raise KeyFaults([("uniform", list(self.uniform), "a lower and a higher bound are wanted")])
-        return self
+            yield "", None, f"exactly one of {names} is wanted; got {', '.join(given) or 'none'}"
+        elif self.uniform is not None and not self.uniform[0] < self.uniform[1]:
+            yield "uniform", list(self.uniform), "a lower and a higher bound are wanted"
 
     def at(self, u: float) -> float:
         """Deviation of which the fraction ``u`` of all draws lies below."""
@@ -63,19 +63,9 @@ class Factor(Shift):
         return float(np.expm1(self.lognormal * ndtri(u))) if self.lognormal is not None else super().at(u)
 
 
+@with_keys(dict.fromkeys(Initial.model_fields, (Shift | None, None)))
 class InitialDispersions(Section):
     """Of the state at the start of the scenario; keys and units are the scenario's own."""
-
-    latitude_deg: Shift | None = None
-    longitude_deg: Shift | None = None
-    altitude_m: Shift | None = None
-    speed_mps: Shift | None = None
-    flight_path_deg: Shift | None = None
-    azimuth_deg: Shift | None = None
-    nose_azimuth_deg: Shift | None = None
-    nose_elevation_deg: Shift | None = None
-    roll_deg: Shift | None = None
-    spin_rpm: Shift | None = None
 
 
 class MassDispersions(Section):
@@ -134,19 +124,15 @@ class Window(Section):
     record_s: Annotated[float, Field(ge=1e-3, le=1.0)] = 0.02
     history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
 
-    @model_validator(mode="after")
-    def _fits(self) -> Window:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if not self.from_s < self.to_s:
-            faults.append(("to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"))
+            yield "to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"
         ratio = self.history_s / self.record_s
         if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-            faults.append(("history_s", self.history_s, f"a whole multiple of record_s = {self.record_s:g} is wanted"))
+            yield "history_s", self.history_s, f"a whole multiple of record_s = {self.record_s:g} is wanted"
         if (self.to_s - self.from_s) / self.record_s > 200_000:
-            faults.append(("record_s", self.record_s, "more than 200 000 records a flight; a longer one is wanted"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "record_s", self.record_s, "more than 200 000 records a flight; a longer one is wanted"
 
     @property
     def records(self) -> int:
@@ -195,7 +181,7 @@ def draws(dispersions: Dispersions, seed: int, run: int) -> dict[str, float]:
 def draw_one(seed: int, run: int, name: str) -> float:
     """Return the number between 0 and 1 of one factor in one run."""
     sequence = np.random.SeedSequence(seed, spawn_key=(run, *name_key(name)))
-    return max(float(np.random.default_rng(sequence).random()), SMALLEST)
+    return max(float(np.random.default_rng(sequence).random()), _SMALLEST)
 
 
 def run_seed(seed: int, run: int) -> int:
@@ -268,15 +254,11 @@ def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     # the offset is the whole vehicle's, the centerbody carries it
     carried = (vehicle.mass_kg / body.mass_kg) * np.array([0.0, of("mass.offset_y_m"), of("mass.offset_z_m")])
-    springs = {
-        "station_m": joint.station_m + of("joint.station_m"),
+    shifted = ("station_m", "freeplay_deg", "quadratic_nmprad2", "hardening_nmprad3", "damping_hardening_nmsprad3")
+    springs = {key: getattr(joint, key) + of(f"joint.{key}") for key in shifted} | {
         "bending_stiffness_nmprad": joint.bending_stiffness_nmprad * (1.0 + of("joint.stiffness")),
         "bending_damping_nmsprad": joint.bending_damping_nmsprad * (1.0 + of("joint.damping")),
         "torsion_stiffness_nmprad": joint.torsion_stiffness_nmprad * (1.0 + of("joint.torsion_stiffness")),
-        "freeplay_deg": joint.freeplay_deg + of("joint.freeplay_deg"),
-        "quadratic_nmprad2": joint.quadratic_nmprad2 + of("joint.quadratic_nmprad2"),
-        "hardening_nmprad3": joint.hardening_nmprad3 + of("joint.hardening_nmprad3"),
-        "damping_hardening_nmsprad3": joint.damping_hardening_nmsprad3 + of("joint.damping_hardening_nmsprad3"),
     }
     return replace(
         vehicle,

@@ -224,7 +224,7 @@ def check_resolved(vehicle: Vehicle, step_s: float) -> None:
         raise ConfigError(
             f"step of {1e3 * step_s:.3g} ms is too long for a bending mode of "
             f"{np.sqrt(stiffness / inertia) / (2.0 * np.pi):.1f} Hz: at most {1e3 * longest:.2g} ms resolves it",
-            code="step-too-coarse",
+            code="step-too-long",
         )
 
 

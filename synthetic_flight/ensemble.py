@@ -26,7 +26,7 @@ import numpy as np
 
 from flightmodel import earth, rotations
 from flightmodel.airdata import total_angle
-from flightmodel.checks import NO_FAULT, ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, ConfigError, FloatArray, GateError, Issue, nearest_name
 from flightmodel.vehicle import Vehicle
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.dispersions import Case, Dispersions, Window, dispersed_case
@@ -104,7 +104,7 @@ def fly_ensemble(
     if workers < 1 or schedule.records < 1 or schedule.per_record < 1 or not schedule.step_s > 0.0:
         raise ConfigError(
             f"fly_ensemble: workers, steps and records must be positive; got {workers}, {schedule}",
-            code="ensemble-arguments",
+            code="argument-value",
         )
     check_mass(vehicle)
     if schedule.frees_joint:
@@ -262,11 +262,11 @@ SCALARS = (
 def check_outputs(names: tuple[str, ...], known: tuple[str, ...]) -> None:
     """Raise `ConfigError` with every name that is unknown or comes twice."""
     faults = [
-        Fault(f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}", "output-unknown")
+        Issue(f"unknown output '{n}'{nearest_name(n, known)}; known: {', '.join(known)}", "name-unknown")
         for n in names
         if n not in known
     ]
-    faults += [Fault(f"output '{n}' comes twice", "output-twice") for n in dict.fromkeys(names) if names.count(n) > 1]
+    faults += [Issue(f"output '{n}' comes twice", "given-twice") for n in dict.fromkeys(names) if names.count(n) > 1]
     if faults:
         raise ConfigError(faults)
 
@@ -295,7 +295,7 @@ def _histories_of(records: Records, names: tuple[str, ...], window: Window) -> F
 def records_of(flown: Flown, vehicle: Vehicle, atmosphere: FloatArray) -> Records:
     """Return what a flight recorded; `GateError` where it did not reach its window."""
     if not len(flown.aux):
-        raise GateError("no record: the joint diverged, or the state was not finite, before the window", "no-record")
+        raise GateError("no record: the joint diverged, or the state was not finite, before the window", "too-few-data")
     return Records(flown.states, flown.aux, vehicle, atmosphere)
 
 
@@ -319,7 +319,7 @@ class Row:
     """What is kept of one flight; ``reason`` says why there is nothing, ``diverged_s`` when its joint passed 90 deg."""
 
     run: int
-    reason: Fault
+    reason: Issue
     diverged_s: float
     scalars: dict[str, float]
     histories: FloatArray
@@ -339,7 +339,7 @@ def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
         raise ConfigError(
             f"window: {max(inflated, begins):g} (inflated) <= from_s = {window.from_s:g} < to_s = {window.to_s:g} <= "
             f"{time.stop_s:g} (the scenario's stop_s) is wanted",
-            code="window-outside-flight",
+            code="time-not-covered",
         )
     out = []
     for start, end, step, lock in (
@@ -388,14 +388,14 @@ def fly_runs(plan: Plan, runs: Sequence[int], draws_of: Callable[[int], dict[str
     return [out[run] for run in runs]
 
 
-def failure_reason(fault: Exception) -> Fault:
+def failure_reason(fault: Exception) -> Issue:
     """Return why a flight failed: message and code of a refusal, the message of any other exception with its type."""
     if isinstance(fault, GateError):
-        return Fault(str(fault), fault.codes[0])
-    return Fault(f"{type(fault).__name__}: {fault}")
+        return Issue(str(fault), fault.codes[0])
+    return Issue(f"{type(fault).__name__}: {fault}")
 
 
-def _failed(plan: Plan, run: int, reason: Fault) -> Row:
+def _failed(plan: Plan, run: int, reason: Issue) -> Row:
     points = len(plan.window.history_time_s())
     nothing = np.full((len(plan.histories), points), np.nan)
     return Row(run, reason, np.nan, dict.fromkeys(plan.scalars, np.nan), nothing)

@@ -694,7 +694,7 @@ def _write_film(frames: Iterable[Image], path: Path, spec: Video, size_px: tuple
     writer = cv2.VideoWriter(str(path), code, float(spec.rate_hz), size_px)
     if not writer.isOpened():
         message = f'{path}: this build of OpenCV cannot write such a film; write images: video.format = "png"'
-        raise GateError(message, code="film-codec")
+        raise GateError(message, code="package-missing")
     count = 0
     try:
         for frame in frames:

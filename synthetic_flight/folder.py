@@ -96,7 +96,7 @@ def _check_telemetry(scenario: Scenario, truth: Truth) -> None:
         raise GateError(
             f"scenario '{scenario.spec.name}': the flight ends at {ended:.2f} s ({why}); time.telemetry_from_s = "
             f"{begins:g} leaves less than {SHORTEST_TELEMETRY_S:g} s to deliver",
-            code="telemetry-too-short",
+            code="time-not-covered",
         )
 
 
@@ -130,12 +130,12 @@ def check_destination(destination: Path, replace: bool) -> None:
     if not replace:
         raise GateError(
             f"{destination}: exists already; choose another folder, or replace it (--force, in Python replace=True)",
-            code="folder-exists",
+            code="file-exists",
         )
     if not ours:
         raise GateError(
             f"{destination}: is not a synthetic flight folder, so --force does not replace it",
-            code="folder-not-synthetic",
+            code="file-exists",
         )
 
 

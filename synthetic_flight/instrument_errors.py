@@ -13,12 +13,13 @@ generator with a name of its own, so that adding one leaves the others as they w
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from flightmodel import rotations
 from flightmodel.checks import BoolArray, FloatArray
@@ -27,7 +28,7 @@ from flightmodel.config import (
     Elevation,
     ErrorAngle,
     Fraction,
-    KeyFaults,
+    KeyFault,
     Latitude,
     Longitude,
     Name,
@@ -47,7 +48,7 @@ from flightmodel.instruments import (
     Bandwidth,
     InstrumentTable,
     Size,
-    check_servo,
+    servo_faults,
     with_keys,
 )
 from flightmodel.refraction import Refractivity
@@ -244,19 +245,14 @@ class Dropouts(Section):
     mean_s: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
     outages_s: tuple[tuple[Time, Time], ...] = ()
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Dropouts:
-        faults: list[tuple[str, object, str]] = [
-            (f"outages_s.{k}", [start, stop], "the outage does not end after it starts")
-            for k, (start, stop) in enumerate(self.outages_s)
-            if stop <= start
-        ]
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        for k, (start, stop) in enumerate(self.outages_s):
+            if stop <= start:
+                yield f"outages_s.{k}", [start, stop], "the outage does not end after it starts"
         if (self.rate_hz > 0.0) != (self.mean_s > 0.0):
             words = f"with mean_s = {self.mean_s:g}; give both positive for bursts, or both zero for none"
-            faults.append(("rate_hz", self.rate_hz, words))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "rate_hz", self.rate_hz, words
 
     @property
     def errors(self) -> DropoutErrors:
@@ -375,12 +371,11 @@ class AirRefraction(Section):
     profile: Annotated[tuple[tuple[ProfileHeight, Refractive], ...], Field(min_length=2)] | None = None
     residual: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
 
-    @model_validator(mode="after")
-    def _increasing(self) -> AirRefraction:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         heights = [height for height, _ in self.profile or ()]
         if any(b <= a for a, b in pairwise(heights)):
-            raise ValueError("heights of the refractivity profile must increase")
-        return self
+            yield "", None, "heights of the refractivity profile must increase"
 
     @property
     def air(self) -> Refractivity:
@@ -418,18 +413,13 @@ class Radar(Section):
     min_elevation_deg: Elevation = 0.0
     dropouts: Dropouts | None = None
 
-    @model_validator(mode="after")
-    def _range_rate_measured(self) -> Radar:
-        given = [key for key in ("range_rate_bias_mps", "range_rate_wander_mps") if getattr(self, key, 0.0) > 0.0]
-        if given and self.range_rate_sd_mps == 0.0:
-            words = "of a range rate that is not measured: state its noise, range_rate_sd_mps, too"
-            raise KeyFaults([(key, getattr(self, key), words) for key in given])
-        return self
-
-    @model_validator(mode="after")
-    def _lag_has_a_servo(self) -> Radar:
-        check_servo("servo_lag", getattr(self, "servo_lag", 0.0), self.angle_servo_hz)
-        return self
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
+        for key in ("range_rate_bias_mps", "range_rate_wander_mps"):
+            if getattr(self, key, 0.0) > 0.0 and self.range_rate_sd_mps == 0.0:
+                words = "of a range rate that is not measured: state its noise, range_rate_sd_mps, too"
+                yield key, getattr(self, key), words
+        yield from servo_faults("servo_lag", getattr(self, "servo_lag", 0.0), self.angle_servo_hz)
 
     @property
     def refraction_left(self) -> float:
@@ -474,11 +464,10 @@ class FilmQuality(Section):
     loaded_deg: ErrorAngle = 0.0
     loaded_shape_deg: tuple[ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
-    @model_validator(mode="after")
-    def _one_shutter(self) -> FilmQuality:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.interlace_s and self.readout_s:
-            raise KeyFaults([("readout_s", self.readout_s, "either fields (interlace_s) or rows in turn")])
-        return self
+            yield "readout_s", self.readout_s, "either fields (interlace_s) or rows in turn"
 
 
 class Video(Section):
@@ -494,14 +483,13 @@ class Video(Section):
     earth: bool = False
     imaging: FilmQuality = FilmQuality()
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Video:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.stop_s < self.start_s:
-            raise KeyFaults([("stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted")])
+            yield "stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted"
         if not self.start_s <= self.benchmark_s <= self.stop_s:
             words = f"a time of the video, {self.start_s:g} to {self.stop_s:g} s, is wanted"
-            raise KeyFaults([("benchmark_s", self.benchmark_s, words)])
-        return self
+            yield "benchmark_s", self.benchmark_s, words
 
 
 class Attitude(Section):

@@ -8,20 +8,21 @@ one refusal names every fault.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel import earth, rotations
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError, check_type, nearest_name
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, check_type, nearest_name
 from flightmodel.config import (
     Angle,
     Duration,
     Elevation,
-    KeyFaults,
+    KeyFault,
     Label,
     Latitude,
     Longitude,
@@ -32,7 +33,7 @@ from flightmodel.config import (
     parse_utc,
     read_toml,
 )
-from flightmodel.vehicle import DATA, Vehicle, vehicle_from_toml, vehicle_path
+from flightmodel.vehicle import Vehicle, path_of, shipped, vehicle_from_toml, vehicle_path
 from synthetic_flight.instrument_errors import (
     Accelerometer,
     Attitude,
@@ -50,7 +51,6 @@ from synthetic_flight.weather import DayOfFlightAtmosphere, MeanAir, day_of_flig
 
 Altitude = Annotated[float, Field(ge=0.0, le=1e6)]
 MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 5_000_000, 20_000
-Faults = list[tuple[str, object, str]]
 
 
 class TimeSpan(Section):
@@ -63,30 +63,27 @@ class TimeSpan(Section):
     step_s: Duration = 0.002
     record_s: Duration = 0.004
 
-    @model_validator(mode="after")
-    def _ordered(self) -> TimeSpan:
-        faults: Faults = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         span, record, step = self.stop_s - self.start_s, self.record_s, self.step_s
         if not self.start_s <= self.telemetry_from_s < self.stop_s:
             words = f"start_s = {self.start_s:g} <= telemetry_from_s < stop_s = {self.stop_s:g} is wanted"
-            faults.append(("telemetry_from_s", self.telemetry_from_s, words))
+            yield "telemetry_from_s", self.telemetry_from_s, words
         if span <= 0.0:
-            raise KeyFaults([*faults, ("stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted")])
+            yield "stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted"
+            return
         if not _is_whole(record / step):
             words = f"a whole multiple of step_s = {step:g} is wanted; try {max(1, round(record / step)) * step:.12g}"
-            faults.append(("record_s", record, words))
+            yield "record_s", record, words
         if not _is_whole(span / record):
             words = f"a whole part of the flight of {span:g} s is wanted; try {span / max(1, round(span / record)):.9g}"
-            faults.append(("record_s", record, f"{words}, or another stop_s"))
+            yield "record_s", record, f"{words}, or another stop_s"
         if span / record > MOST_RECORDS:
             words = f"{span / record:.2g} records, {span / record * 304e-9:.1f} GB, where {MOST_RECORDS} are the most"
-            faults.append(("record_s", record, f"{words}; at least {span / MOST_RECORDS:.2g} s is wanted"))
+            yield "record_s", record, f"{words}; at least {span / MOST_RECORDS:.2g} s is wanted"
         if span / step > MOST_STEPS:
             words = f"{span / step:.2g} steps, hours of computing, where {MOST_STEPS:.0e} are the most"
-            faults.append(("step_s", step, f"{words}; at least {span / MOST_STEPS:.2g} s is wanted"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "step_s", step, f"{words}; at least {span / MOST_STEPS:.2g} s is wanted"
 
 
 def _is_whole(ratio: float) -> bool:
@@ -159,17 +156,16 @@ class ScenarioFile(Section):
         alone = {} if self.video is None else {"video": self.video}
         return alone | {f"videos.{name}": video for name, video in self.videos.items()}
 
-    @model_validator(mode="after")
-    def _in_time(self) -> ScenarioFile:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         start, stop = self.time.telemetry_from_s, self.time.stop_s
-        words, faults = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted", Faults()
+        words = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted"
         if not self.radars and not self.gnss:
-            faults.append(("radars", "", "at least one tracker is wanted: a table [radars.NAME] or [gnss.NAME]"))
-        faults += [
-            (f"gnss.{n}", "", "a radar has this name; results go by name") for n in self.gnss if n in self.radars
-        ]
+            yield "radars", "", "at least one tracker is wanted: a table [radars.NAME] or [gnss.NAME]"
+        for name in sorted(self.gnss.keys() & self.radars.keys()):
+            yield f"gnss.{name}", "", "a radar has this name; results go by name"
         if not start <= self.attitude_prior.t_s <= stop:
-            faults.append(("attitude_prior.t_s", self.attitude_prior.t_s, words))
+            yield "attitude_prior.t_s", self.attitude_prior.t_s, words
         instruments: dict[str, Triad | SunSensors | Radar | Gnss | None] = {
             "accelerometer": self.accelerometer,
             "rates": self.rates,
@@ -181,29 +177,24 @@ class ScenarioFile(Section):
         for name, part in instruments.items():
             if part is not None:
                 offset = part.offset_s if isinstance(part, Radar | Gnss) else 0.0
-                faults += _rate_faults(name, part.rate_hz, stop - start - offset)
+                yield from _rate_faults(name, part.rate_hz, stop - start - offset)
         if self.video is not None and self.videos:
-            faults.append(("video", "", "write one camera in [video], several in [videos.NAME]"))
+            yield "video", "", "write one camera in [video], several in [videos.NAME]"
         for table, video in self.films.items():
-            outside = [(f"{table}.{k}", getattr(video, k)) for k in ("start_s", "stop_s")]
-            faults += [(key, value, words) for key, value in outside if not start <= value <= stop]
+            for key in ("start_s", "stop_s"):
+                if not start <= getattr(video, key) <= stop:
+                    yield f"{table}.{key}", getattr(video, key), words
             count = (video.stop_s - video.start_s) * video.rate_hz
             if count > MOST_FRAMES:
-                faults.append((f"{table}.rate_hz", video.rate_hz, f"{count:.2g} frames, at most {MOST_FRAMES}"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+                yield f"{table}.rate_hz", video.rate_hz, f"{count:.2g} frames, at most {MOST_FRAMES}"
 
 
-def _rate_faults(name: str, rate_hz: float, span_s: float) -> Faults:
+def _rate_faults(name: str, rate_hz: float, span_s: float) -> Iterable[KeyFault]:
     count = rate_hz * span_s
     if count > MOST_SAMPLES:
-        return [(f"{name}.rate_hz", rate_hz, f"{count:.2g} samples, at most {MOST_SAMPLES}; lower the rate")]
+        yield f"{name}.rate_hz", rate_hz, f"{count:.2g} samples, at most {MOST_SAMPLES}; lower the rate"
     if count < 2.0:
-        return [
-            (f"{name}.rate_hz", rate_hz, f"fewer than three samples in the telemetry's {span_s:g} s; raise the rate")
-        ]
-    return []
+        yield f"{name}.rate_hz", rate_hz, f"fewer than three samples in the telemetry's {span_s:g} s; raise the rate"
 
 
 @dataclass(frozen=True)
@@ -223,20 +214,16 @@ class Scenario:
 
 def shipped_scenarios() -> list[str]:
     """Names of the scenarios that ship with the toolkit."""
-    return sorted(p.stem for p in (DATA / "scenarios").glob("*.toml"))
+    return shipped("scenario")
 
 
 def read_scenario(name: str | Path) -> Scenario:
     """Read a scenario: a path to a TOML file, or the name of one that ships with the toolkit."""
     check_type("scenario", name, (str, Path), "a shipped name or the path of a TOML file")
-    name, shipped = str(name), shipped_scenarios()
-    if not name.endswith(".toml") and name not in shipped:
-        hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no scenario '{name}'{hint}", code="scenario-unknown")
-    path = Path(name) if name.endswith(".toml") else DATA / "scenarios" / f"{name}.toml"
+    path = path_of("scenario", str(name), "name-unknown")
     tables = read_toml(path)
     spec, vehicle = None, None
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     try:
         spec = parse_section(ScenarioFile, tables, str(path))
     except ConfigError as fault:
@@ -255,7 +242,7 @@ def read_scenario(name: str | Path) -> Scenario:
     raise ConfigError(faults)
 
 
-def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fault]:
+def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Issue]:
     """Return which sensor packages and cameras the scenario ``path`` needs and the vehicle lacks."""
     packages, cameras = list(vehicle.sensors), list(vehicle.cameras)
     faults = []
@@ -267,7 +254,7 @@ def _vehicle_faults(spec: ScenarioFile, vehicle: Vehicle, path: Path) -> list[Fa
         if name not in known:
             hint = f"{nearest_name(name, known)}; known there: {', '.join(known) or 'none'}"
             message = f"{path}: key '{key}' = {name!r}: {vehicle.source} has no [{table}.{name}]{hint}"
-            faults.append(Fault(message, "camera-unknown" if table == "cameras" else "mount-unknown"))
+            faults.append(Issue(message, "name-unknown"))
     return faults
 
 
@@ -279,17 +266,10 @@ def child_rng(seed: int, name: str) -> np.random.Generator:
 def initial_state(scenario: Scenario) -> FloatArray:
     """State (20,) at the scenario's start, joint undeflected."""
     spec, start = scenario.spec.initial, scenario.spec.time.start_s
-    lat, lon, path, azimuth, nose_az, nose_el, roll = np.deg2rad(
-        [
-            spec.latitude_deg,
-            spec.longitude_deg,
-            spec.flight_path_deg,
-            spec.azimuth_deg,
-            spec.nose_azimuth_deg,
-            spec.nose_elevation_deg,
-            spec.roll_deg,
-        ]
+    lat, lon, path, azimuth = np.deg2rad(
+        [spec.latitude_deg, spec.longitude_deg, spec.flight_path_deg, spec.azimuth_deg]
     )
+    nose_az, nose_el, roll = np.deg2rad([spec.nose_azimuth_deg, spec.nose_elevation_deg, spec.roll_deg])
     position = earth.ecef_from_geodetic(lat, lon, spec.altitude_m)
     heading = np.array([np.cos(path) * np.cos(azimuth), np.cos(path) * np.sin(azimuth), -np.sin(path)])
     velocity = earth.ecef_from_ned(spec.speed_mps * heading, position)

@@ -223,7 +223,7 @@ def integrate(
         raise ConfigError(
             f"integrate: a state (20,), step_s > 0, per_record and records >= 1 are wanted; got state {state.shape}, "
             f"step_s {step_s:g}, per_record {per_record}, records {records}",
-            code="integration-arguments",
+            code="argument-value",
         )
     parameters = parameter_vector(vehicle)[None]
     schedule = Schedule(step_s, per_record, records, lock_records)
@@ -330,12 +330,12 @@ def fly(
         raise ConfigError(
             f"fly: 0 < step <= record <= stop - start is wanted; got step {step_s:g} s, record {record_s:g} s, "
             f"start {start_s:g} s, stop {stop_s:g} s",
-            code="flight-times",
+            code="argument-value",
         )
     per_record = round(record_s / step_s)
     if abs(per_record * step_s - record_s) > 1e-9:
         raise ConfigError(
-            f"fly: record {record_s:g} s must be a whole multiple of step {step_s:g} s", code="record-step"
+            f"fly: record {record_s:g} s must be a whole multiple of step {step_s:g} s", code="argument-value"
         )
     check_finite("fly: state at the start", state)
     if inflated_s is None or inflated_s < stop_s:

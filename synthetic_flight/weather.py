@@ -19,6 +19,7 @@ MIL-F-8785C, section 3.7 (Dryden spectra, 1-cosine gust).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -27,7 +28,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_validator
 
 from flightmodel.atmosphere import (
     TABLES,
@@ -40,7 +41,7 @@ from flightmodel.atmosphere import (
     us76,
 )
 from flightmodel.checks import ConfigError, FloatArray
-from flightmodel.config import FileBeside, Fraction, KeyFaults, Section, parse_utc
+from flightmodel.config import FileBeside, Fraction, KeyFault, Section, parse_utc
 from synthetic_flight.instrument_errors import gauss_markov
 
 Wind = Annotated[float, Field(ge=-500.0, le=500.0)]
@@ -80,11 +81,10 @@ class Turbulence(Section):
     from_m: Altitude
     to_m: Altitude
 
-    @model_validator(mode="after")
-    def _band(self) -> Turbulence:
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.to_m - self.from_m < 2.0 * self.length_m:
-            raise ValueError("a band from_m to to_m of at least two length_m is wanted")
-        return self
+            yield "", None, "a band from_m to to_m of at least two length_m is wanted"
 
 
 class DiscreteGust(Section):
@@ -136,18 +136,14 @@ class DayOfFlightAtmosphere(Section):
             )
         return value
 
-    @model_validator(mode="after")
-    def _fit_each_other(self) -> DayOfFlightAtmosphere:
-        faults: list[tuple[str, object, str]] = []
+    def key_faults(self) -> Iterable[KeyFault]:
+        """Yield what does not go together."""
         if self.from_ is not None and "base" in self.model_fields_set:
-            faults.append(("from", self.from_, f"base = '{self.base}' states another air; keep one of the two"))
+            yield "from", self.from_, f"base = '{self.base}' states another air; keep one of the two"
         if self.mean_wind is not None and not self.winds:
-            faults.append(("winds", False, "mean_wind states winds; remove one of the two"))
+            yield "winds", False, "mean_wind states winds; remove one of the two"
         if any(b[0] <= a[0] for a, b in pairwise(self.mean_wind or ())):
-            faults.append(("mean_wind", "", "altitudes must increase"))
-        if faults:
-            raise KeyFaults(faults)
-        return self
+            yield "mean_wind", "", "altitudes must increase"
 
     @property
     def structure_sd(self) -> tuple[float, float]:
@@ -199,7 +195,7 @@ def mean_air(
     Raises
     ------
     ConfigError
-        Where its sounding cannot be read, or NRLMSIS is asked for without the library (``nrlmsis-missing``).
+        Where its sounding cannot be read, or NRLMSIS is asked for without the library (``package-missing``).
     """
     if spec.from_ is not None:
         base: AtmosphereProfile | None = _measured(folder / spec.from_)
@@ -232,7 +228,7 @@ def _wind_table() -> tuple[FloatArray, FloatArray, FloatArray]:
 def seasonal_wind(month: int, latitude_rad: float) -> FloatArray:
     """Zonal-mean wind of a month (1 to 12) and latitude, ``(n, 3)``: altitude km, north (0) and east wind m/s.
 
-    In gradient balance with NRLMSIS 2.1's pressures (``data/atmosphere/mean_winds.py``).
+    In gradient balance with NRLMSIS 2.1's pressures (``tools/mean_winds.py``).
     """
     latitudes, altitude_km, wind = _wind_table()
     east = [np.interp(np.rad2deg(latitude_rad), latitudes, column) for column in wind[month - 1].T]

@@ -25,7 +25,7 @@ from estimators.calibration import calibrate_lens, read_corners
 from flightmodel import aerodynamics
 from flightmodel.aerodynamics import read_with_sidecar
 from flightmodel.camera_edits import EDITS_FILE, read_edits
-from flightmodel.checks import Fault, GateError
+from flightmodel.checks import GateError, Issue
 from flightmodel.film import Frames
 from flightmodel.flightfolder import read_flight, read_flight_file
 from flightmodel.geometry import FEATURE_KINDS, torus_circles
@@ -326,11 +326,11 @@ def _compare(telemetry: Any, name: str, data: bytes) -> str:
     got = _keys(read_rows(telemetry, name), name)
     strange = [row for row in got if row not in set(wanted)]
     if strange:
-        return Fault(f"read {strange[0]}, which the file does not hold", "row-changed")
+        return Issue(f"read {strange[0]}, which the file does not hold", "row-changed")
     source = SOURCES.get(name, name)
     lost = [row for row in wanted if row not in set(got)]
     if (lost or len(got) != len(wanted)) and not any(f.source == source for f in telemetry.findings):
-        return Fault(f"{len(wanted)} rows became {len(got)} without a finding", "row-lost")
+        return Issue(f"{len(wanted)} rows became {len(got)} without a finding", "row-lost")
     return ""
 
 

@@ -1,7 +1,7 @@
 """The command's own ``main`` in this process: the same codes and words without two seconds of imports.
 
-Films are read and figures drawn here too, as where the second process cannot be started:
-`tests.postflight.test_second_process` has that one.
+Films are read and figures drawn here too, as where no process can be started beside: `tests.postflight.test_beside`
+has that one.
 """
 
 from __future__ import annotations
@@ -17,15 +17,12 @@ import pytest
 
 def draw_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let figures be drawn by this process."""
-    from multiprocessing.context import SpawnProcess
+    from postflight.beside import Beside, Task
 
-    from postflight import second_process
+    def here(_self: Beside, task: Task[object], _wanted: bool) -> Task[object]:
+        return task
 
-    class NoProcess(SpawnProcess):
-        def start(self) -> None:
-            raise OSError("not started by tests")
-
-    monkeypatch.setattr(second_process, "_made", lambda *_: NoProcess())
+    monkeypatch.setattr(Beside, "_begun", here)
 
 
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., SimpleNamespace]:

@@ -164,7 +164,7 @@ def test_page_of_codes_has_every_code_that_tests_expect():
 
 @pytest.mark.parametrize(
     ("code", "words"),
-    [("epoch-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
+    [("value-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
 )
 def test_page_of_codes_says_what_the_message_says(code: str, words: str):
     assert words in message_codes().message_codes()[code]

@@ -75,7 +75,7 @@ def test_a_path_with_nul_is_refused(tmp_path):
     fuzzing.write_flight(tmp_path / "f")
     file = tmp_path / "f/flight.toml"
     file.write_text(file.read_text().replace("telemetry/gnss.csv", "telemetry/gn\\u0000ss.csv"))
-    with refuses("path-nul", kind=ConfigError):
+    with refuses("path-refused", kind=ConfigError):
         read_flight(tmp_path / "f")
 
 
@@ -131,12 +131,12 @@ def test_coefficient_column_that_stands_twice_is_refused(tmp_path):
     (tmp_path / "aero.csv").write_text(
         fuzzing.AERO.replace("cm,cmq", "ca,cm,cmq").replace("\n0,", "\n0,0,").replace("\n5,", "\n5,0,")
     )
-    with refuses("column-twice", names=["ca"]):
+    with refuses("given-twice", names=["ca"]):
         read_aero_table(tmp_path / "aero.csv")
 
 
 @pytest.mark.parametrize(("spoilt", "code", "name"), [
-    (("X_m", "X_mm"), "table-column-missing", "'X_m'"),
+    (("X_m", "X_mm"), "column-missing", "'X_m'"),
     (("0.03,", "0.03;"), "row-ragged", ""),
     (("0.03,", "é,"), "not-a-number", "é"),
     (("0.03,", ","), "not-a-number", ""),
@@ -185,7 +185,7 @@ def test_picture_that_would_fill_the_memory_is_refused_by_its_head(tmp_path, mon
     path.write_bytes(data[: len(data) - tail])
     monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("unpacked"))
     camera = next(iter(vehicle_from_toml(vehicle_path("irve2_reference")).cameras.values()))
-    assert image_fault(path, camera.size_px).code == "image-size"
+    assert image_fault(path, camera.size_px).code == "frame-size"
 
 
 @pytest.mark.parametrize(
@@ -197,7 +197,7 @@ def test_film_that_names_other_files_is_not_opened(cases, monkeypatch, text):
     film.write_bytes(text.encode())
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: pytest.fail("opened"))
     try:
-        with refuses("film-unreadable"):
+        with refuses("file-unreadable"):
             read_flight(case.root)
     finally:
         film.write_bytes(clean)

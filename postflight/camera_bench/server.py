@@ -209,6 +209,6 @@ def session_of(flight: Flight, folder: Path, camera: str | None = None) -> Sessi
     name = next(iter(films)) if camera is None else camera
     if name not in films:
         words = f"--camera {name}{nearest_name(name, films)}: the flight has films of {', '.join(films)}"
-        raise ConfigError(words, code="camera-unknown")
+        raise ConfigError(words, code="name-unknown")
     compile_kernels("camera")
     return Session(folder, films[name], flight.telemetry.required_vehicle())

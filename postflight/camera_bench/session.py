@@ -25,7 +25,7 @@ from estimators.frame_solution import FrameFit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import EDITS_FILE, POSE, CameraEdits, Edit, faults_of, read_edits, write_edits
-from flightmodel.checks import NO_FAULT, Fault, FloatArray, GateError
+from flightmodel.checks import NO_FAULT, FloatArray, GateError, Issue
 from flightmodel.files import file_bytes
 from flightmodel.film import Frames
 from flightmodel.vehicle import Vehicle
@@ -41,7 +41,7 @@ class _Work:
 
     frames: Frames
     oriented: OrientedCamera | None
-    trouble: Fault
+    trouble: Issue
     fits: dict[int, FrameFit]
 
 
@@ -185,7 +185,7 @@ class Session:
         """
         frames = self._work.frames
         if len(rows) > MOST_EDITS:
-            raise GateError(f"{len(rows)} edits; at most {MOST_EDITS}", code="edit-too-long")
+            raise GateError(f"{len(rows)} edits; at most {MOST_EDITS}", code="value-range")
         wanted = [_edit_of(row, frames.camera_name) for row in rows]
         faults = faults_of(wanted, frames.time_s, frames.camera.size_px)
         if faults:
@@ -231,7 +231,7 @@ class Session:
         try:
             oriented = orient_on_film(frames, self.vehicle)
         except GateError as fault:
-            return _Work(frames, None, Fault(str(fault), fault.codes[0]), {})
+            return _Work(frames, None, Issue(str(fault), fault.codes[0]), {})
         return _Work(frames, oriented, NO_FAULT, {})
 
     def _fit_all(self) -> None:
@@ -291,7 +291,7 @@ def _answer_json(fit: FrameFit) -> dict[str, Any]:
     return out
 
 
-def _said(fault: Fault) -> dict[str, str] | None:
+def _said(fault: Issue) -> dict[str, str] | None:
     return {"words": str(fault), "code": fault.code} if fault else None
 
 
@@ -311,9 +311,9 @@ def _edit_of(row: dict[str, Any], camera: str) -> Edit:
         numbers = {k: float("nan") if row.get(k) is None else float(row[k]) for k in ("t_s", "u_px", "v_px", "value")}
         words: dict[str, str] = {k: row.get(k, "") for k in ("edit", "name", "note")}
     except (TypeError, ValueError, AttributeError):
-        raise GateError("camera edits: no edit", code="edit-unknown") from None
+        raise GateError("camera edits: no edit", code="edit-unusable") from None
     if not all(isinstance(word, str) for word in words.values()):
-        raise GateError("camera edits: no edit", code="edit-unknown")
+        raise GateError("camera edits: no edit", code="edit-unusable")
     t_s, u_px, v_px, value = (numbers[k] for k in ("t_s", "u_px", "v_px", "value"))
     return Edit(camera, t_s, words["edit"], words["name"], u_px, v_px, value, words["note"])
 

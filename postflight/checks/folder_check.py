@@ -22,13 +22,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from flightmodel import earth
-from flightmodel.checks import Fault, FloatArray, GateError
+from flightmodel.checks import FloatArray, GateError, Issue
 from flightmodel.config import FILL_IN, read_toml
 from flightmodel.film import NO_PICTURE, Frames, film_fault, image_fault
 from flightmodel.flightfolder import Sources, assumed_errors, read_sources
 from flightmodel.gate import FROZEN_S
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import Finding, GnssRecord, RadarRecord
+from flightmodel.telemetry import GnssRecord, RadarRecord
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
 from postflight.checks.track_force import best_comparison, bias_of, track_force
@@ -62,12 +62,12 @@ class Report(Tabular):
     """Everything that a check found; ``exit_code`` as the command leaves with."""
 
     facts: list[Fact] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
-    cross_checks: list[Finding] = field(default_factory=list)
+    findings: list[Issue] = field(default_factory=list)
+    cross_checks: list[Issue] = field(default_factory=list)
     time_biases: list[TimeBias] = field(default_factory=list)
     assumed: dict[str, dict[str, float]] = field(default_factory=dict)
     fill_in: list[str] = field(default_factory=list)
-    refused: list[Fault] = field(default_factory=list)
+    refused: list[Issue] = field(default_factory=list)
     exit_code: int = 0
 
     def to_frame(self) -> pd.DataFrame:
@@ -107,11 +107,9 @@ class Report(Tabular):
 
 
 def _rows(items: Iterable[Any]) -> list[dict[str, Any]]:
-    """Dataclasses as JSON objects."""
-    return [
-        {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in asdict(item).items()}
-        for item in items
-    ]
+    """Dataclasses and issues as JSON objects."""
+    rows = [item.as_row() if isinstance(item, Issue) else asdict(item) for item in items]
+    return [{k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()} for row in rows]
 
 
 def check_folder(folder: Path) -> Report:
@@ -147,7 +145,7 @@ def check_folder(folder: Path) -> Report:
     return report
 
 
-def _not_used(folder: Path) -> list[Finding]:
+def _not_used(folder: Path) -> list[Issue]:
     """Tables below ``telemetry/`` that flight.toml does not name: delivered, imported perhaps, and read by nobody."""
     try:
         named = set(_texts(read_toml(folder / "flight.toml")))
@@ -155,7 +153,7 @@ def _not_used(folder: Path) -> list[Finding]:
         return []
     there = sorted(path.relative_to(folder).as_posix() for path in (folder / "telemetry").glob("*.csv"))
     words = "no table of flight.toml reads it; declare its columns there, or remove it"
-    return [Finding(name, words, np.nan, np.nan, "file-not-used") for name in there if name not in named]
+    return [Issue(words, "file-not-used", name) for name in there if name not in named]
 
 
 def _texts(value: Any) -> Iterator[str]:
@@ -167,7 +165,7 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(inner)
 
 
-def _vehicle_faults(folder: Path) -> list[Fault]:
+def _vehicle_faults(folder: Path) -> list[Issue]:
     """Faults of the vehicle file, which is not reached where flight.toml has some."""
     try:
         named = read_toml(folder / "flight.toml").get("vehicle")
@@ -178,13 +176,14 @@ def _vehicle_faults(folder: Path) -> list[Fault]:
     try:
         vehicle_from_toml(vehicle_path(named, folder))
     except GateError as fault:
-        return [Fault(f"vehicle: {words}", words.code) for words in fault.faults]
+        return [Issue(f"vehicle: {words}", words.code) for words in fault.faults]
     return []
 
 
-def _refuse(report: Report, folder: Path, faults: Sequence[str], code: int) -> None:
-    report.fill_in = placeholders(folder)
-    report.refused = [Fault(words) for words in faults if FILL_IN not in words]
+def _refuse(report: Report, folder: Path, faults: Sequence[Issue], code: int) -> None:
+    still_open = placeholders(folder)
+    report.fill_in = [f"{path}: key '{key}' {FILL_IN}" for path, keys in still_open.items() for key in keys]
+    report.refused = [fault for fault in faults if FILL_IN not in fault]
     report.exit_code = code
 
 
@@ -245,7 +244,7 @@ def _cross_check(found: Sources, report: Report) -> None:
         _against_accelerometer(found, name, record, report)
     strapdown = found.spec.motion.model == "strapdown"
     swings = inertial.oscillation_of(found.triads if strapdown else {}, found.vehicle)
-    remarks += [f for f in swings.remarks if not any(r.code.startswith("accelerometer-") for r in remarks)]
+    remarks += [f for f in swings.remarks if not any(map(_doubts_accelerometer, remarks))]
     _keep_sharp(report, swings.bias)
     rotation, lag = pressure_and_field.field_rotation(found)
     if lag is not None:
@@ -259,6 +258,11 @@ def _cross_check(found: Sources, report: Report) -> None:
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
     report.findings += text_in_films(found) + frozen_films(found)
+
+
+def _doubts_accelerometer(remark: Issue) -> bool:
+    """Whether a remark says that the accelerometer's unit, scale or axes are wrong."""
+    return remark.source == "accelerometer" and remark.code in ("unit-suspect", "accelerometer-scale", "axes-suspect")
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
@@ -283,7 +287,7 @@ def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report:
     force = track_force(record.time_s, tracks.position_of(record, found.spec.body), _FORCE_WIDTH_S, found.spec.body)
     if force is None or "accelerometer" not in found.triads:
         return
-    if not any(f.code == "accelerometer-axes" for f in remarks):
+    if not any(f.source == "accelerometer" and f.code == "axes-suspect" for f in remarks):
         remarks += inertial.entry_axis(found, force)
     if not remarks:
         remarks += inertial.gyro_axes(found, force)
@@ -341,7 +345,7 @@ def print_report(report: Report) -> None:
     for words, code in few_of_each(report.findings):
         console.coded("[yellow]found[/]", words, code)
     for remark in report.cross_checks:
-        console.coded("[red]suspicious[/]", str(remark), remark.code)
+        console.coded("[red]suspicious[/]", remark.line, remark.code)
     for bias in report.time_biases:
         mark = "[yellow]worth a look[/] time bias" if bias.is_worth_a_look else "time bias"
         console.coded(mark, f"{bias.source}: {bias.late_s:+.3f} +/- {bias.sd_s:.3f} s against {bias.against}")
@@ -358,12 +362,12 @@ def print_report(report: Report) -> None:
 # a camera's benchmark frame, tried as a run would use it: seconds where the lens is not calibrated
 
 
-def benchmark_frame(found: Sources) -> list[Finding]:
+def benchmark_frame(found: Sources) -> list[Issue]:
     """Check that every camera's benchmark frame orients it.
 
     Returns
     -------
-    list of Finding
+    list of Issue
         Why it does not, with the code that a run would refuse the film with; or ``features-not-found`` (or the code of
         the failed orientation) where another way had to be taken than by the features that the vehicle file states.
     """
@@ -371,7 +375,7 @@ def benchmark_frame(found: Sources) -> list[Finding]:
     return [finding for table, frames in films.items() for finding in _tried(table, frames, found.vehicle)]
 
 
-def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding]:
+def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Issue]:
     if vehicle is None or not len(frames.time_s):
         return []
     from postflight.filming import orient_on_film  # which a folder without video needs not wait for
@@ -380,14 +384,14 @@ def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Finding
     try:
         oriented = orient_on_film(frames, vehicle)
     except GateError as fault:
-        return [Finding(source, str(fault), at, at, fault.codes[0])]
+        return [Issue(str(fault), fault.codes[0], source, at, at)]
     if oriented.stated_refused:
         words = f"{oriented.stated_refused}; a run goes by the edge and the shell's texture"
-        return [Finding(source, words, at, at, oriented.stated_refused.code)]
+        return [Issue(words, oriented.stated_refused.code, source, at, at)]
     return []
 
 
-def text_in_films(found: Sources) -> list[Finding]:
+def text_in_films(found: Sources) -> list[Issue]:
     """Find text burnt into films, which is left out of what the camera reads."""
     out = []
     for name, frames in found.films.items():
@@ -395,16 +399,16 @@ def text_in_films(found: Sources) -> list[Finding]:
         if hidden is not None:
             share = f"{100.0 * np.mean(hidden):.0f} % of the picture"
             words = f"text burnt into the film, or dead lines of its detector: {share} is left out"
-            out.append(Finding(name, words, float(frames.time_s[0]), float(frames.time_s[-1]), code="text-burnt-in"))
+            out.append(Issue(words, "text-burnt-in", name, float(frames.time_s[0]), float(frames.time_s[-1])))
     return out
 
 
-def frozen_films(found: Sources) -> list[Finding]:
-    """Find pictures that a film repeats to the last bit, which noise forbids: ``film-frozen`` for each stretch."""
+def frozen_films(found: Sources) -> list[Issue]:
+    """Find pictures that a film repeats to the last bit, which noise forbids: ``frame-frozen`` for each stretch."""
     return [one for name, film in found.films.items() for one in _repeats(name, film)]
 
 
-def _repeats(name: str, film: Frames) -> list[Finding]:
+def _repeats(name: str, film: Frames) -> list[Issue]:
     filed_px = film.filed_px or film.camera.size_px
     last = 0 if film.numbers is None else int(film.numbers[-1])
     fault = (lambda path: film_fault(path, filed_px, last)) if last else (lambda path: image_fault(path, filed_px))
@@ -417,6 +421,6 @@ def _repeats(name: str, film: Frames) -> list[Finding]:
         start, end = float(film.time_s[first]), float(film.time_s[max(k - 1, 0)])
         if k - first >= _FROZEN_FRAMES and end - start >= FROZEN_S:
             words = f"{k - first} frames repeat one picture: the film stood still there; leave them out (use_s)"
-            out.append(Finding(name, words, start, end, "film-frozen"))
+            out.append(Issue(words, "frame-frozen", name, start, end))
         first, before = k, now
     return out

@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import BoolArray, Fault, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, Issue
 from flightmodel.flightfolder import Sources
-from flightmodel.telemetry import LARGEST_GAP_S, AttitudePrior, Finding, TriadRecord
+from flightmodel.telemetry import LARGEST_GAP_S, AttitudePrior, TriadRecord
 from flightmodel.vehicle import Vehicle
 from postflight.checks.track_force import Comparison, TrackForce
 from postflight.checks.units_and_axes import (
@@ -65,13 +65,13 @@ _FARTHEST_S = 600.0  # that gyros are trusted to carry an attitude
 _DEGREE = np.pi / 180.0
 # slips in writing a quaternion: hint and code, and the order that undoes it (None: the conjugate)
 _SLIPS = {
-    Fault("with the scalar last, so put its last number first", "attitude-scalar-last"): [3, 0, 1, 2],
-    Fault("as from ECEF to body, so change the signs of its last three numbers", "attitude-inverted"): None,
+    Issue("with the scalar last, so put its last number first", "attitude-convention"): [3, 0, 1, 2],
+    Issue("as from ECEF to body, so change the signs of its last three numbers", "attitude-convention"): None,
 }
 
 
-def sparse(found: Sources) -> list[Finding]:
-    """Name sensors whose samples are too far apart for the forces of a flight (``samples-too-sparse``)."""
+def sparse(found: Sources) -> list[Issue]:
+    """Name sensors whose samples are too far apart for the forces of a flight (``too-few-data``)."""
     if found.spec.motion.model == "ballistic":
         return []
     out = []
@@ -81,11 +81,11 @@ def sparse(found: Sources) -> list[Finding]:
         if record is not None and step > 1.01 * LARGEST_GAP_S:
             words = f"samples are usually {step:.3g} s apart: forces at the c.g. need ten a second, an attitude more"
             ends = float(record.time_s[0]), float(record.time_s[-1])
-            out.append(Finding(name, f"{words}; deliver the data at their full rate", *ends, "samples-too-sparse"))
+            out.append(Issue(f"{words}; deliver the data at their full rate", "too-few-data", name, *ends))
     return out
 
 
-def at_rest(found: Sources) -> list[Finding]:
+def at_rest(found: Sources) -> list[Issue]:
     """Check the accelerometer's unit where it is at rest, at the record's start or end.
 
     Parameters
@@ -95,8 +95,8 @@ def at_rest(found: Sources) -> list[Finding]:
 
     Returns
     -------
-    list of Finding
-        ``accelerometer-unit``, or none.
+    list of Issue
+        ``unit-suspect``, or none.
     """
     record, rates = found.triads.get("accelerometer"), found.triads.get("rates")
     if record is None or rates is None:
@@ -116,12 +116,12 @@ def at_rest(found: Sources) -> list[Finding]:
         hint = unit_hint(declared, unit_that_explains(earth.STANDARD_GRAVITY_MPS2 / mean, declared, 0.02))
         if hint:
             words = f"reads {mean:.4g} m/s2 at rest, where 9.81 is expected{hint}"
-            return [Finding("accelerometer", words, float(start), float(start + _REST_S), "accelerometer-unit")]
+            return [Issue(words, "unit-suspect", "accelerometer", float(start), float(start + _REST_S))]
     return []
 
 
-def against_track(found: Sources, tracker: str, seen: Comparison) -> list[Finding]:
-    """Check the accelerometer's scale against a track's: ``accelerometer-unit``, ``accelerometer-scale`` or none."""
+def against_track(found: Sources, tracker: str, seen: Comparison) -> list[Issue]:
+    """Check the accelerometer's scale against a track's: ``unit-suspect``, ``accelerometer-scale`` or none."""
     if seen.scale <= 0.0 or seen.scale_sd > 0.1 * seen.scale or 1 / _FAR < seen.scale < _FAR:
         return []
     if abs(np.log(seen.scale)) * seen.scale < _SURE * seen.scale_sd:
@@ -129,13 +129,13 @@ def against_track(found: Sources, tracker: str, seen: Comparison) -> list[Findin
     declared = _accelerometer_unit(found)
     hint = unit_hint(declared, unit_that_explains(seen.scale, declared, max(0.05, 3.0 * seen.scale_sd / seen.scale)))
     words = f"{tracker}'s track implies {seen.scale:.3g} +/- {seen.scale_sd:.2g} times its reading"
-    code = "accelerometer-unit" if hint else "accelerometer-scale"
+    code = "unit-suspect" if hint else "accelerometer-scale"
     words += hint or "; no other unit explains it: check both units"
-    return [Finding("accelerometer", words, seen.start_s, seen.end_s, code)]
+    return [Issue(words, code, "accelerometer", seen.start_s, seen.end_s)]
 
 
-def entry_axis(found: Sources, force: TrackForce) -> list[Finding]:
-    """Check that the drag in descent is read along -x of the body: ``accelerometer-axes`` or none."""
+def entry_axis(found: Sources, force: TrackForce) -> list[Issue]:
+    """Check that the drag in descent is read along -x of the body: ``axes-suspect`` or none."""
     record = found.triads.get("accelerometer")
     if record is None or found.vehicle is None:
         return []
@@ -162,11 +162,11 @@ def entry_axis(found: Sources, force: TrackForce) -> list[Finding]:
         "check mount, column order, signs"
     )
     times = force.time_s[strong]
-    return [Finding("accelerometer", words, float(times[0]), float(times[-1]), "accelerometer-axes")]
+    return [Issue(words, "axes-suspect", "accelerometer", float(times[0]), float(times[-1]))]
 
 
-def lever(found: Sources) -> list[Finding]:
-    """Check the gyros' unit by the centripetal acceleration at the accelerometer: ``gyro-unit`` or none."""
+def lever(found: Sources) -> list[Issue]:
+    """Check the gyros' unit by the centripetal acceleration at the accelerometer: ``unit-suspect`` or none."""
     record, rates, vehicle = found.triads.get("accelerometer"), found.triads.get("rates"), found.vehicle
     source = found.spec.sensors.rates
     if record is None or rates is None or vehicle is None or source is None:
@@ -186,10 +186,10 @@ def lever(found: Sources) -> list[Finding]:
         f"imply a centripetal acceleration of {float(np.nanmedian(inward)):.3g} m/s2 at the accelerometer, which reads "
         f"{float(np.nanmedian(felt)):.2g} (medians){hint}"
     )
-    return [Finding("rates", words, float(rates.time_s[0]), float(rates.time_s[-1]), "gyro-unit")]
+    return [Issue(words, "unit-suspect", "rates", float(rates.time_s[0]), float(rates.time_s[-1]))]
 
 
-def place(found: Sources) -> list[Finding]:
+def place(found: Sources) -> list[Issue]:
     """Check that the accelerometer lies between the nose and the aft end: ``sensor-outside`` or none."""
     record, vehicle = found.triads.get("accelerometer"), found.vehicle
     if record is None or vehicle is None:
@@ -199,7 +199,7 @@ def place(found: Sources) -> list[Finding]:
     if -length <= x <= 0.0:
         return []
     words = f"lies {x:+.2f} m from the nose, x forward; the vehicle reaches from {-length:.2f} to 0 m: check its sign"
-    return [Finding("accelerometer", words, np.nan, np.nan, "sensor-outside")]
+    return [Issue(words, "sensor-outside", "accelerometer")]
 
 
 def _accelerometer_unit(found: Sources) -> str:
@@ -219,7 +219,7 @@ def _sum_of_readings(record: TriadRecord, force: TrackForce, use: BoolArray) -> 
     return np.asarray(seen[np.isfinite(seen).all(axis=1)].sum(axis=0))
 
 
-def gyro_axes(found: Sources, force: TrackForce) -> list[Finding]:
+def gyro_axes(found: Sources, force: TrackForce) -> list[Issue]:
     """Check scale, order and signs of the gyros by the force that they carry.
 
     Parameters
@@ -231,8 +231,8 @@ def gyro_axes(found: Sources, force: TrackForce) -> list[Finding]:
 
     Returns
     -------
-    list of Finding
-        ``gyro-unit``, ``gyro-axes``, ``gyro-rotation`` (which of both is open), or none.
+    list of Issue
+        ``unit-suspect``, ``axes-suspect``, ``axes-suspect`` (which of both is open), or none.
     """
     gyros, sensed = found.triads.get("rates"), found.triads.get("accelerometer")
     source = found.spec.sensors.rates
@@ -261,20 +261,20 @@ def gyro_axes(found: Sources, force: TrackForce) -> list[Finding]:
     near = [r for r, value in zip(readings, off, strict=True) if value < max(2 * best, _RATES_RIGHT_RAD)]
     code, hint = _which(near, readings[int(np.argmin(off))], best, unit_of(source, tables.RATES[0]))
     words = f"carry the specific force {np.rad2deg(own):.0f} deg away from the track's{hint}"
-    return [Finding("rates", words, float(times[0]), float(times[-1]), code)]
+    return [Issue(words, code, "rates", float(times[0]), float(times[-1]))]
 
 
 def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) -> tuple[str, str]:
     """Code and hint of what would mend the rates: all good readings differ by unit alone, by axes alone, or by both."""
     scale, axes = best
     if all(r[1] == AS_DECLARED for r in near):
-        return "gyro-unit", unit_hint(declared, unit_that_explains(scale, declared))
+        return "unit-suspect", unit_hint(declared, unit_that_explains(scale, declared))
     if all(r[0] == 1.0 for r in near):
-        return "gyro-axes", f"; with body x, y, z read from {axes_named(*axes)} it is {np.rad2deg(off_rad):.0f} deg"
-    return "gyro-rotation", ": check their unit, order and signs"
+        return "axes-suspect", f"; with body x, y, z read from {axes_named(*axes)} it is {np.rad2deg(off_rad):.0f} deg"
+    return "axes-suspect", ": check their unit, order and signs"
 
 
-def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
+def attitude_prior(found: Sources, force: TrackForce) -> list[Issue]:
     """Check the attitude prior by the force that the gyros carry from it: ``attitude-prior`` or none."""
     prior, gyros, sensed = found.attitude_prior, found.triads.get("rates"), found.triads.get("accelerometer")
     if prior is None or gyros is None or sensed is None:
@@ -309,7 +309,7 @@ def attitude_prior(found: Sources, force: TrackForce) -> list[Finding]:
     else:
         hint = ": is q_ecef_body scalar first, from body to ECEF, and of that time?"
     words = f"the gyros carry the specific force from it {np.rad2deg(off[0]):.0f} deg away from the track's{hint}"
-    return [Finding("attitude_prior", words, prior.time_s, float(force.time_s[clear[-1]]), code)]
+    return [Issue(words, code, "attitude_prior", prior.time_s, float(force.time_s[clear[-1]]))]
 
 
 def _as_stated_and_slipped(prior: AttitudePrior, planet: earth.Planet) -> FloatArray:
@@ -369,7 +369,7 @@ def _wander(sums: FloatArray, track_mps2: FloatArray) -> FloatArray:
 class Swings(NamedTuple):
     """Remarks about axes, and the time bias of the accelerometer against the gyros; None where nothing shows it."""
 
-    remarks: list[Finding]
+    remarks: list[Issue]
     bias: TimeBias | None
 
 
@@ -393,4 +393,4 @@ def oscillation_of(triads: Mapping[str, TriadRecord], vehicle: Vehicle | None) -
         return Swings([], TimeBias("accelerometer", "rates", swings.lag_s, LAG_STEP_S / 2.0))
     check = axes_check(swings, *sensors)
     span = float(force.time_s[0]), float(force.time_s[-1])
-    return Swings([Finding("accelerometer, rates", check.remark, *span, "triads-axes")], None)
+    return Swings([Issue(check.remark, "triads-axes", "accelerometer, rates", *span)], None)

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from flightmodel import earth, tables
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, Issue
 from flightmodel.flightfolder import Sources
 from flightmodel.geomagnetism_and_sun import magnetic_field_ned_t
-from flightmodel.telemetry import BarometerRecord, Finding, TriadRecord
+from flightmodel.telemetry import BarometerRecord, TriadRecord
 from postflight.checks.units_and_axes import (
     AS_DECLARED,
     all_axes,
@@ -37,8 +37,8 @@ _MOST_SAMPLES = 4000  # enough for two numbers, and quick on a long flight
 _LARGEST_LAG_S, _COARSE_S = 0.5, 0.025  # of a clock set to half a second; a sixteenth of a turn at 2.5 Hz
 
 
-def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray) -> list[Finding]:
-    """Check a barometer's unit by its changes of height against a track's: ``barometer-unit`` or none.
+def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, height_m: FloatArray) -> list[Issue]:
+    """Check a barometer's unit by its changes of height against a track's: ``unit-suspect`` or none.
 
     The track has heights above the ellipsoid (n,) at its times (n,).
     """
@@ -61,11 +61,11 @@ def barometer_unit(found: Sources, record: BarometerRecord, time_s: FloatArray, 
     if not hint or sd > 0.05 * ratio:
         return []
     words = f"its height changes by 1/{ratio:.3g} of the track's{hint}"
-    return [Finding(name, words, float(t[inside][0]), float(t[inside][-1]), "barometer-unit")]
+    return [Issue(words, "unit-suspect", name, float(t[inside][0]), float(t[inside][-1]))]
 
 
-def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) -> list[Finding]:
-    """Check the magnitude of the magnetometer's reading against the Earth's field: ``magnetometer-unit`` or none.
+def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) -> list[Issue]:
+    """Check the magnitude of the magnetometer's reading against the Earth's field: ``unit-suspect`` or none.
 
     Parameters
     ----------
@@ -94,16 +94,16 @@ def field_size(found: Sources, time_s: FloatArray, position_ecef_m: FloatArray) 
     hint = unit_hint(declared, unit_that_explains(ratio, declared, np.log(3.0)))
     words = f"reads {1e6 * float(np.median(seen)):.3g} uT where the Earth's field is {1e6 * expected:.3g} uT{hint}"
     times = record.time_s[rows]
-    return [Finding("magnetometer", words, float(times[0]), float(times[-1]), "magnetometer-unit")]
+    return [Issue(words, "unit-suspect", "magnetometer", float(times[0]), float(times[-1]))]
 
 
-def field_rotation(found: Sources) -> tuple[list[Finding], tuple[float, float] | None]:
+def field_rotation(found: Sources) -> tuple[list[Issue], tuple[float, float] | None]:
     """Compare the gyros with the rotation of the magnetic field in the body.
 
     Returns
     -------
-    findings : list of Finding
-        ``gyro-axes``, ``gyro-unit``, or none.
+    findings : list of Issue
+        ``axes-suspect``, ``unit-suspect``, or none.
     lag : (float, float) or None
         How late the magnetometer's time tags are against the gyros', s, and its standard deviation; None where the
         gyros do not explain the rotation.
@@ -130,13 +130,13 @@ def field_rotation(found: Sources) -> tuple[list[Finding], tuple[float, float] |
             f"explain {100 * own:.0f} % of the field's rotation in the body; with body x, y, z read from {others} it "
             f"is {100 * best:.0f} %: check order, signs and both mounts"
         )
-        return [Finding("rates", words, *span, "gyro-axes")], None
-    out: list[Finding] = []
+        return [Issue(words, "axes-suspect", "rates", *span)], None
+    out: list[Issue] = []
     if own > _EXPLAINED and not 0.8 < scale < 1.25:
         declared = unit_of(source, tables.RATES[0])
         hint = unit_hint(declared, unit_that_explains(scale, declared, 0.2))
         out.append(
-            Finding("rates", f"the field rotates {scale:.3g} times as fast as they read{hint}", *span, "gyro-unit")
+            Issue(f"the field rotates {scale:.3g} times as fast as they read{hint}", "unit-suspect", "rates", *span)
         )
     return out, _lag(gyros, field) if own > _EXPLAINED else None
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from itertools import combinations
 
+from flightmodel.checks import Issue
 from flightmodel.telemetry import Telemetry
 from postflight.checks import inertial, tracks
 from postflight.checks.track_force import best_comparison, bias_of
 from postflight.checks.units_and_axes import clock_remarks
-from recon.fault_isolation import TRIADS, FaultHypothesis
+from recon.fault_isolation import TRIADS
 
 
-def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[FaultHypothesis, ...]:
+def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[Issue, ...]:
     """Clocks that are off by more than 5 sd and 0.1 s, with the sensors between which they are.
 
     Parameters
@@ -45,5 +46,5 @@ def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[F
         others = tuple(name for name in involved if name not in clock)
         # one tracker that several others contradict is alone; else either side may be the one in error
         alone = len(clock) == 1 and clock[0] not in TRIADS and len(set(others) - set(TRIADS)) > 0
-        out.append(FaultHypothesis(str(remark), remark.code, clock if alone else (*clock, *others)))
+        out.append(Issue(remark.line, remark.code, clock if alone else (*clock, *others)))
     return tuple(out)

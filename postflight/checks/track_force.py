@@ -39,19 +39,18 @@ class TrackForce:
     ----------
     time_s : (n,) float
     width_s : float
-    position_m, velocity_mps, acceleration_mps2 : (n, 3) float
+    position_m, velocity_mps : (n, 3) float
         Inertial axes (ECEF at time zero).
     force_mps2 : (n, 3) float
         Specific force, the same axes.
     covariance : (n, 3, 3) float
-        Of acceleration and force, from the scatter of the positions about their quadratic.
+        Of the force, from the scatter of the positions about their quadratic.
     """
 
     time_s: FloatArray
     width_s: float
     position_m: FloatArray
     velocity_mps: FloatArray
-    acceleration_mps2: FloatArray
     force_mps2: FloatArray
     covariance: FloatArray
     planet: earth.Planet = earth.WGS84
@@ -124,7 +123,7 @@ def track_force(
         return None
     centres, place, velocity, acceleration, covariance = (np.array(part) for part in zip(*rows, strict=True))
     force = acceleration - earth.gravitation(place, planet)
-    return TrackForce(centres, width_s, place, velocity, acceleration, force, covariance, planet)
+    return TrackForce(centres, width_s, place, velocity, force, covariance, planet)
 
 
 def best_comparison(

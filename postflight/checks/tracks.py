@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from flightmodel import earth, tables
-from flightmodel.checks import BoolArray, FloatArray
+from flightmodel.checks import BoolArray, FloatArray, Issue
 from flightmodel.flightfolder import Sources
 from flightmodel.instruments import RADAR
 from flightmodel.tables import read_unit
-from flightmodel.telemetry import Finding, GnssRecord, RadarRecord, Telemetry
+from flightmodel.telemetry import GnssRecord, RadarRecord, Telemetry
 from postflight.checks.track_force import TrackForce, coasting, track_force
 from postflight.checks.units_and_axes import (
     TimeBias,
@@ -61,8 +61,8 @@ def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.W
 # spans of time
 
 
-def outside_time(found: Sources) -> list[Finding]:
-    """Check that tables and the attitude prior lie in the time of the others: ``time-span`` for each that does not."""
+def outside_time(found: Sources) -> list[Issue]:
+    """Check that tables and the attitude prior lie in the time of the others: ``time-not-covered`` if not."""
     spans = _spans(found)
     first = next((name for name in ("accelerometer", "rates", *found.radars, *found.gnss) if name in spans), None)
     if first is None:
@@ -72,7 +72,7 @@ def outside_time(found: Sources) -> list[Finding]:
     for name, (start, stop) in spans.items():
         if stop < low or start > high:
             words = f"lies outside the {first}'s time, {low:.1f} to {high:.1f} s{_hours(start, stop, low, high)}"
-            out.append(Finding(name, words, start, stop, "time-span"))
+            out.append(Issue(words, "time-not-covered", name, start, stop))
     prior = found.attitude_prior
     carrier = spans.get("rates")
     if prior is not None and carrier is not None and found.spec.motion.model == "strapdown":
@@ -81,7 +81,7 @@ def outside_time(found: Sources) -> list[Finding]:
         if not low - _CARRIED_S <= t <= high + _CARRIED_S:
             hint = _hours(t, t, low, high)
             words = f"lies outside the gyros' time, {low:.1f} to {high:.1f} s, and they cannot carry it{hint}"
-            out.append(Finding("attitude_prior", words, t, t, "time-span"))
+            out.append(Issue(words, "time-not-covered", "attitude_prior", t, t))
     return out
 
 
@@ -105,8 +105,8 @@ def _hours(start: float, stop: float, low: float, high: float) -> str:
 # units of a radar, by free fall
 
 
-def free_fall(found: Sources, record: RadarRecord) -> list[Finding]:
-    """Check a radar's units and order of angles by free fall: ``radar-unit``, ``radar-angles-exchanged``, or none."""
+def free_fall(found: Sources, record: RadarRecord) -> list[Issue]:
+    """Check a radar's units and order of angles by free fall: ``unit-suspect``, ``axes-suspect``, or none."""
     name = record.spec.name
     declared = tuple(unit_of(found.spec.radars[name], q) for q in tables.RADAR)
     shares = {}
@@ -119,15 +119,15 @@ def free_fall(found: Sources, record: RadarRecord) -> list[Finding]:
     if own is None or own > _DENIED or not better:
         return []
     best = max(better, key=lambda units: better[units])
-    code, hint = "radar-unit", "several other units of its columns fit"
+    code, hint = "unit-suspect", "several other units of its columns fit"
     if not any(share > better[best] - 0.1 for units, share in better.items() if units != best):
         pairs = zip(("range", "az", "el"), declared, best, strict=False)
         changes = [f"{short} in '{new}' instead of '{old}'" for short, old, new in pairs if old != new]
         if best[3] == "el az":
-            code, changes = "radar-angles-exchanged", [*changes, "azimuth and elevation exchanged"]
+            code, changes = "axes-suspect", [*changes, "azimuth and elevation exchanged"]
         hint = f"{', '.join(changes)} would fit"
     words = f"in coast {100 * own:.0f} % of its track's windows are free of force, as gravitation asks; {hint}"
-    return [Finding(name, words, *span, code)]
+    return [Issue(words, code, name, *span)]
 
 
 def _candidates(declared: tuple[str, ...]) -> list[tuple[str, ...]]:
@@ -182,8 +182,8 @@ def _sharp(force: TrackForce) -> BoolArray:
 # a receiver's velocities
 
 
-def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
-    """Check a receiver's velocities against displacements: ``gnss-velocity-sign``, ``gnss-velocity-unit`` or none."""
+def receiver_velocity(found: Sources, record: GnssRecord) -> list[Issue]:
+    """Check a receiver's velocities against displacements: ``axes-suspect``, ``unit-suspect`` or none."""
     from scipy.integrate import cumulative_trapezoid  # a tenth of a second
 
     name, t, p, v = record.spec.name, record.time_s, record.position_ecef_m, record.velocity_ecef_mps
@@ -211,7 +211,7 @@ def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
         if abs(slope + 1.0) < 0.2:
             axis = ("north", "east", "down")[k]
             words = f"its velocity has the opposite sign of its displacement, {axis}: check that axis (up for down?)"
-            out.append(Finding(name, words, *span, "gnss-velocity-sign"))
+            out.append(Issue(words, "axes-suspect", name, *span))
     ratio = float(np.median([abs(s) for _, s in sure])) if sure else 1.0
     if ratio > 0.0 and not 0.8 < ratio < 1.25:
         entry = found.spec.gnss[name]
@@ -219,7 +219,7 @@ def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
         declared = unit_of(entry, stated)
         hint = unit_hint(declared, unit_that_explains(ratio, declared))
         words = f"its displacement is {ratio:.3g} times its integrated velocity{hint}"
-        out.append(Finding(name, words, *span, "gnss-velocity-unit"))
+        out.append(Issue(words, "unit-suspect", name, *span))
     return out
 
 
@@ -228,7 +228,7 @@ def receiver_velocity(found: Sources, record: GnssRecord) -> list[Finding]:
 
 def tracker_pair(
     trackers: Mapping[str, RadarRecord | GnssRecord], first: str, second: str, planet: earth.Planet
-) -> tuple[list[Finding], TimeBias | None]:
+) -> tuple[list[Issue], TimeBias | None]:
     """Compare two trackers where both are.
 
     Parameters
@@ -241,7 +241,7 @@ def tracker_pair(
 
     Returns
     -------
-    findings : list of Finding
+    findings : list of Issue
         ``tracker-distance``, or none.
     bias : TimeBias or None
         Of the second's time tags against the first's, where the distance lies along the motion.
@@ -269,7 +269,7 @@ def tracker_pair(
             f"{distance / 1000:.3g} km from {first} (median), where their errors are {own:.0f} m: check site, units "
             "and times of both"
         )
-        return [Finding(second, words, *span, "tracker-distance")], bias
+        return [Issue(words, "tracker-distance", second, *span)], bias
     return [], bias
 
 

@@ -13,9 +13,8 @@ from itertools import permutations, product
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, Issue
 from flightmodel.tables import UNITS, Quantity, Source, place, read_unit
-from flightmodel.telemetry import Finding
 
 Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))
@@ -99,7 +98,7 @@ class TimeBias:
         return abs(self.late_s) > _WORTH_A_LOOK_SD * self.sd_s and not self.is_significant
 
 
-def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Finding]:
+def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Issue]:
     """Return a remark for each clock that is off, where time biases between pairs are significant.
 
     A clock that is late by ``x`` is late against each other by ``x``: the clock that explains the biases best (weighted
@@ -121,7 +120,7 @@ def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Findin
             f"time tags are {abs(late_s):.3f} +/- {sd_s:.3f} s {which} than those of {' and '.join(others)}; "
             f"if {name} is the one in error, add {-late_s:+.3f} to its time.offset_s, else {late_s:+.3f} to theirs"
         )
-        out.append(Finding(name, words, np.nan, np.nan, "clock-lag"))
+        out.append(Issue(words, "clock-lag", name))
         signs = _signs(clock, left)
         left = [replace(b, late_s=b.late_s - late_s * float(sign)) for b, sign in zip(left, signs, strict=True)]
     return out

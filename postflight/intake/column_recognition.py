@@ -26,6 +26,7 @@ from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import (
     AXES,
     BODY_RATES,
+    MARKS,
     NED,
     QUANTITIES,
     SEVERAL_MEANINGS,
@@ -47,22 +48,9 @@ _BANDS: dict[str, list[tuple[float, float, str]]] = {
     "temperature": [(150.0, 400.0, "k"), (-120.0, 60.0, "degc")],
     "density": [(0.5, 1.5, "kgpm3"), (500.0, 1500.0, "gpm3")],
 }
-_FASTEST_RADPS = 400.0
-_G_OR_GAUSS = {"acceleration", "magnetic field"}
-_FIELD_GAUSS = (0.15, 0.9)  # the Earth's, with some iron, and less than 1 g
-_EARTH_RADII_M = (6.2e6, 7.5e6)
 _IRIG = re.compile(r"^\d{1,3}:\d{1,2}:\d{2}:\d{2}([.,]\d+)?$")
 _OF_DAY = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _ISO = re.compile(r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}")
-_CLOCK_PARTS = (
-    {"h", "hour", "hours", "stunde", "hh"},
-    {"m", "min", "minute", "mm"},
-    {"s", "sec", "second", "sekunde", "ss"},
-)
-_SINCE_1970 = {"time", "t", "unix", "epoch", "timestamp", "zeit"}
-_NOT_FROM_T0 = {"tow", "sod", "utc", "gmt", "gps", "week"}  # seconds of these do not start at t0
-_UNIX_S = (1e9, 2.5e9)
-_FASTEST_S, _SLOWEST_S = 2e-5, 60.0
 _THREE_AXIS: dict[str, tuple[str, tuple[Quantity, ...]]] = {
     "acceleration": ("sensors.accelerometer", tables.ACCELEROMETER),
     "rate": ("sensors.rates", tables.RATES),
@@ -72,9 +60,6 @@ _ENDINGS = {"radars": "_radar", "gnss": "_gnss", "barometers": "_baro"}
 _MOUNT = 'a package of the vehicle file, or "body"; or axes = ["+x", "+y", "+z"]: which body axis is each of its axes?'
 _AIR = ("alt", "rho", "temperature", "pressure", "wind_speed", "wind_from")
 _AIR_BY_COMPONENTS = ("wind_north", "wind_east")
-_OF_COMPONENTS = {"n", "e", "u", "v", "north", "east", "northward", "eastward"}
-_RECEIVER = {"gps", "gnss", "hae", "ellipsoid"}  # in the name of a height
-_OF_AIR = {"baro", "barometer", "barometric", "pressure", "press", "qnh"}
 _Family = tuple[tuple[str, ...], str]
 
 
@@ -120,10 +105,8 @@ class SourceProposal:
 # units by numbers
 
 
-def _vector_unit(kind: str, values: FloatArray) -> tuple[str, str]:
-    """Return the unit of three axes (n, 3) of a kind, and why; an empty unit with what was seen where that is open."""
-    size = np.linalg.norm(values, axis=1)
-    size = size[np.isfinite(size)]
+def _vector_unit(kind: str, size: FloatArray) -> tuple[str, str]:
+    """Return the unit of vectors of sizes (n,) of a kind, and why; an empty unit with what was seen if that is open."""
     if not len(size):
         return "", "no numbers"
     if kind == "acceleration":
@@ -137,7 +120,7 @@ def _vector_unit(kind: str, values: FloatArray) -> tuple[str, str]:
     if kind == "magnetic field":
         middle = float(np.median(size))
         return _band(kind, middle), f"magnitude {middle:.3g} (median)"
-    if kind == "rate" and size.max() > _FASTEST_RADPS:
+    if kind == "rate" and size.max() > 400.0:
         return "degps", f"up to {size.max():.4g}: no body rotates at so many rad/s"
     return "", f"magnitude up to {float(size.max()):.3g}"
 
@@ -181,11 +164,10 @@ def add_clock_columns(table: FreeFormTable) -> None:
             for number, short in enumerate(("h", "m", "s"), start=1):
                 _add(table, f"{name}_{short}", [m[number].replace(",", ".") if m else "" for m in parts])
             table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
-        elif first and set(re.findall(r"[a-z]+", name.lower())) & _SINCE_1970:
+        elif first and set(re.findall(r"[a-z]+", name.lower())) & MARKS["since_1970"]:
             values = table.numbers(k)
-            scale = next(
-                (s for s in (1.0, 1e-3, 1e-6) if _UNIX_S[0] < np.nanmin(values, initial=np.inf) * s < _UNIX_S[1]), None
-            )
+            first_s = np.nanmin(values, initial=np.inf)
+            scale = next((s for s in (1.0, 1e-3, 1e-6) if 1e9 < first_s * s < 2.5e9), None)
             if scale is not None:
                 stamps = (values * scale * 1e6).round()
                 iso = [f"{np.datetime64(int(s), 'us')}Z" if np.isfinite(s) else "" for s in stamps]
@@ -224,7 +206,7 @@ def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | N
     best = min(seconds, key=lambda k: (table.names[k] != "t_s", not named[k].units("time"), k))
     others = tuple(table.names[k] for k in seconds if k != best) + (parts or ())
     unit, how, why = _time_unit(named[best], table.numbers(best))
-    asked = bool(set(named[best].tokens) & _NOT_FROM_T0)
+    asked = bool(set(named[best].tokens) & MARKS["not_from_t0"])
     return TimeProposal((table.names[best],), "seconds", unit, how, why, asked, others)
 
 
@@ -241,8 +223,8 @@ def _hour_minute_second(table: FreeFormTable, named: list[ColumnName]) -> tuple[
     """Columns of hour, minute and second whose names differ in their last part alone."""
     parts = [re.findall("[a-z]+", n.name.lower()) for n in named]
     found = []
-    for spellings, top in zip(_CLOCK_PARTS, (24, 60, 61), strict=True):
-        last = [k for k, p in enumerate(parts) if p and p[-1] in spellings and (len(p) > 1 or len(named[k].name) > 1)]
+    for part, top in (("hour", 24), ("minute", 60), ("second", 61)):
+        last = [k for k, p in enumerate(parts) if p and p[-1] in MARKS[part] and (len(p) > 1 or len(named[k].name) > 1)]
         fitting = [
             k for k in last if np.nanmax(table.numbers(k), initial=-1.0) < top and np.nanmin(table.numbers(k)) >= 0
         ]
@@ -277,7 +259,7 @@ def _time_unit(named: ColumnName, values: FloatArray) -> tuple[str, str, str]:
     usual = float(np.median(step[step > 0.0]))
     whole = bool((known == np.round(known)).all())
     seen = f"steps of {usual:.4g}"
-    if not whole and usual < _SLOWEST_S and usual * 1e-3 < _FASTEST_S * 10:
+    if not whole and usual < 60.0 and usual * 1e-3 < 2e-4:
         return "s", NUMBERS, f"{seen}: as ms they would be {1e3 / usual:.3g} Hz"
     return "", ASKED, seen
 
@@ -371,7 +353,7 @@ class Recogniser:
             if kind in ("rate", "magnetic field", "acceleration") or kind in worded:
                 return kind, "unit"
             return "", ""
-        if stated == _G_OR_GAUSS and not worded and self._is_g(at):
+        if stated == {"acceleration", "magnetic field"} and not worded and self._is_g(at):
             return "acceleration", "three axes"
         if stated and len(fitting) != 1:
             return "", ""
@@ -386,17 +368,21 @@ class Recogniser:
         families = self._families()
         if any(family == "body" or matching(stem, VECTORS["rate"]) for stem, family in families):
             return False
-        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
-        size = size[np.isfinite(size)]
+        size = self._sizes(at)
         return len(size) > 0 and float(size.std()) > _STEADY * float(size.mean())
+
+    def _sizes(self, at: list[int]) -> FloatArray:
+        """Sizes (n,) of the vectors of three columns where all are known."""
+        size: FloatArray = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
+        return size[np.isfinite(size)]
 
     def _is_g(self, at: list[int]) -> bool:
         """Whether ``g`` is no gauss: a small letter, or of a magnitude that the Earth's field has nowhere."""
         if all(unit_key(self.named[k].unit_text) == self.named[k].unit_text for k in at):
             return True
-        size = np.linalg.norm(np.column_stack([self.table.numbers(k) for k in at]), axis=1)
-        size = size[np.isfinite(size)]
-        return len(size) > 0 and not _FIELD_GAUSS[0] < float(np.median(size)) < _FIELD_GAUSS[1]
+        size = self._sizes(at)
+        # the Earth's field, with some iron, and less than 1 g
+        return len(size) > 0 and not 0.15 < float(np.median(size)) < 0.9
 
     def may_be_inertial(self) -> bool:
         """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
@@ -416,7 +402,7 @@ class Recogniser:
     def _vector_columns(
         self, kind: str, quantities: Iterable[Quantity], at: list[int], why: str
     ) -> list[ColumnProposal]:
-        by_numbers, seen = _vector_unit(kind, np.column_stack([self.table.numbers(k) for k in at]))
+        by_numbers, seen = _vector_unit(kind, self._sizes(at))
         out = []
         for q, k in zip(quantities, at, strict=True):
             unit = next(iter(self.named[k].units(kind)), "")
@@ -438,7 +424,7 @@ class Recogniser:
         tokens = {k: self.named[k].tokens for k in sorted(self.free)}
         found = [k for k, own in tokens.items() if matching(own, words) or "".join(own) in words]
         if short == "wind_speed":  # "wind from" is no speed, "wind north" none of the whole wind
-            found = [k for k in found if not set(tokens[k]) & (QUANTITIES["wind_from"] | _OF_COMPONENTS)]
+            found = [k for k in found if not set(tokens[k]) & (QUANTITIES["wind_from"] | MARKS["wind_component"])]
         return sorted(found, key=lambda k: (len(set(tokens[k]) - words), k))
 
     def _single(
@@ -487,15 +473,15 @@ class Recogniser:
                 names = ", ".join(f"'{self.table.names[k]}'" for k in first)
                 self.table.notes.append(f"{names}: whole degrees beside fixes are taken as computed from these")
                 return []
-        found = [self._single(q) for q in tables.RADAR]
-        if any(m is None for m in found):
+        found = [m for q in tables.RADAR if (m := self._single(q))]
+        if len(found) < len(tables.RADAR):
             return []
         keys = [(key, FILL_IN_TOML, words) for key, words in (
             ("latitude_deg", "deg: the radar's site, WGS-84"), ("longitude_deg", "deg, east positive"),
             ("height_m", "m above the ellipsoid"),
         )]  # fmt: skip
         found += self._own_noise(tables.TRACKER_SD)
-        return [SourceProposal(f"radars.{self.name}", [m for m in found if m], keys)]
+        return [SourceProposal(f"radars.{self.name}", found, keys)]
 
     def _receiver(self) -> list[SourceProposal]:
         """Positions by latitude and longitude or ECEF, velocities."""
@@ -510,11 +496,7 @@ class Recogniser:
             height, key = self._height(quantity["alt"], beside)
             found += [height] if height else []
             keys += key
-        for shorts in (("vx", "vy", "vz"), ("vn", "ve", "vd")):
-            velocity = self._vectors("speed", shorts)
-            if velocity:
-                found += velocity
-                break
+        found += self._vectors("speed", ("vx", "vy", "vz")) or self._vectors("speed", ("vn", "ve", "vd"))
         satellites = self.columns_of("nsat")
         if satellites:
             self.free.discard(satellites[0])
@@ -550,21 +532,18 @@ class Recogniser:
         unit = next(iter(self.named[at[0]].units("length")), "m")
         axes = [tables.to_si(self.table.numbers(k).copy(), unit) for k in at]
         size: FloatArray = np.linalg.norm(np.column_stack(axes), axis=1)
-        return bool(_EARTH_RADII_M[0] < np.nanmedian(size) < _EARTH_RADII_M[1])
+        return bool(6.2e6 < np.nanmedian(size) < 7.5e6)
 
     def _height(
         self, quantity: Quantity, beside: list[int]
     ) -> tuple[ColumnProposal | None, list[tuple[str, str, str]]]:
         """Claim a receiver's height: by its name, then the one that stands next to its latitude and longitude."""
         candidates = sorted(self.columns_of("alt"), key=lambda k: self._strangeness(k, beside))
-        ell = [k for k in candidates if set(self.named[k].tokens) & {"ell", "ellipsoid", "hae", "wgs", "wgs84"}]
-        msl = [k for k in candidates if set(self.named[k].tokens) & {"msl", "amsl", "geoid", "nn", "sea"}]
-        if ell:
-            self._set_aside(set(candidates) - {ell[0]})
-            return self._single(quantity, among=ell), [("height_is", '"ellipsoid"', "by the column's name")]
-        if msl:
-            self._set_aside(set(candidates) - {msl[0]})
-            return self._single(quantity, among=msl), [("height_is", '"msl"', "by the column's name")]
+        for mark, above in (("ellipsoid", '"ellipsoid"'), ("sea_level", '"msl"')):
+            stated = [k for k in candidates if set(self.named[k].tokens) & MARKS[mark]]
+            if stated:
+                self._set_aside(set(candidates) - {stated[0]})
+                return self._single(quantity, among=stated), [("height_is", above, "by the column's name")]
         found = self._single(quantity, among=candidates)
         if found is not None and len(candidates) > 1:
             others = ", ".join(f"'{self.table.names[k]}'" for k in candidates if self.table.names[k] != found.column)
@@ -576,7 +555,13 @@ class Recogniser:
         own = {t for t in self.named[k].tokens if t.isalpha()} - QUANTITIES["alt"]
         theirs = {t for at in beside for t in self.named[at].tokens} - QUANTITIES["lat"] - QUANTITIES["lon"]
         away = min((abs(k - at) for at in beside), default=0)
-        return not own & _RECEIVER, bool(own & _OF_AIR), len(own ^ theirs), away, k < min(beside, default=0)
+        return (
+            not own & MARKS["receiver"],
+            bool(own & MARKS["air"]),
+            len(own ^ theirs),
+            away,
+            k < min(beside, default=0),
+        )
 
     def _set_aside(self, at: set[int]) -> None:
         self.spare |= at & self.free
@@ -585,9 +570,7 @@ class Recogniser:
     def _barometer(self) -> list[SourceProposal]:
         """Static pressure, or heights."""
         height, pressure = tables.BAROMETER
-        found = self._single(pressure)
-        if found is None:
-            found = self._single(height, "alt")
+        found = self._single(pressure) or self._single(height, "alt")
         if found is None:
             return []
         what = '"ellipsoid" or "msl"; pressures too'

@@ -15,15 +15,13 @@ components along height; nothing is extrapolated. Wind directions stay where the
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 import shutil
 import sys
 import tomllib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,7 @@ from rich.table import Table
 
 from flightmodel.aerodynamics import COLUMNS, named_columns
 from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
-from flightmodel.checks import ConfigError, Fault, FloatArray, GateError
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import read_toml
 from flightmodel.files import file_bytes, write_file, writing
 from flightmodel.film import start_fault
@@ -56,24 +54,18 @@ from postflight.intake.column_recognition import (
 )
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.freeform_tables import FreeFormTable
-from postflight.intake.headers import fold, parse_column_name
+from postflight.intake.headers import MARKS, fold, parse_column_name
 from postflight.intake.stored_tables import read_tables
 from postflight.terminal import terminal
 
 _WIND_AXES = (*COLUMNS[:2], "cd", "cl", *COLUMNS[4:])
-_DAVEML = (".dml",)
 _TABLES = (  # what is named so and holds no table is refused
     ".csv", ".tsv", ".dat", ".asc", ".tab", ".mat", ".xlsx", ".xlsm", ".xls", ".parquet", ".nc", ".cdf", ".h5", ".hdf5",
 )  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _FILMS = (".webm", ".mp4", ".avi")
-_FRAME_TOKENS = {"frame", "frames", "frameno", "picture", "image", "bild"}
-_BELONG = 0.9  # of a list's names, in the folder that it is of
 _RADIOSONDE = {"alt", "temperature", "pressure"}
 _BY_DIRECTION, _BY_COMPONENTS = {"wind_speed", "wind_from"}, {"wind_north", "wind_east"}
-_GEOMETRIC = {"gps", "gnss", "geometric", "ell", "ellipsoid", "hae"}  # in the name of a height
-_ZERO_C_K = 273.15
-_LOWEST_M, _HIGHEST_M = -1000.0, 2e5
 EXIT_NOT_ALL_USED = 3
 console = terminal()
 
@@ -97,10 +89,7 @@ def as_coefficients(table: FreeFormTable, columns: dict[str, str]) -> bytes:
     changed = [f"{old} as {new}" for old, new in zip(table.names, names, strict=True) if old != new]
     if changed:
         table.notes.append(f"columns renamed: {', '.join(changed)}")
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerows([names, *table.rows])
-    return out.getvalue().encode()
+    return replace(table, names=names, raw=None).as_csv()
 
 
 def sidecar_text(columns: dict[str, str]) -> str:
@@ -110,18 +99,7 @@ def sidecar_text(columns: dict[str, str]) -> str:
     axes = "wind" if "cd" in columns else "body"
     value = "0.0".ljust(9) if nose else FILL_IN_TOML
     why = f"; by '{columns['cm']}'" if nose else ""
-    return (
-        "# What the numbers of the coefficient table of this name refer to. Values FILL IN are needed.\n"
-        f"source = {FILL_IN_TOML}                      # where they come from\n"
-        f"licence = {FILL_IN_TOML}                     # on what terms\n"
-        f"area_m2 = {FILL_IN_TOML}                     # m2: reference area of the coefficients\n"
-        f"length_m = {FILL_IN_TOML}                    # m: reference length of the moments\n"
-        f"moment_reference_station_m = {value}   # m aft of the nose: the point that C_m is about{why}\n"
-        f'axes = "{axes}"                           # "body": C_A and C_N; "wind": C_D and C_L\n'
-        'damping_per = "ql/2V"                   # or "ql/V"\n'
-        "# [uncertainty]                         # one standard deviation, as fractions\n"
-        "# ca = 0.03\n# cn = 0.07\n# cm = 0.1\n"
-    )
+    return template("coefficients").format(moment_station=value, why=why, axes=axes)
 
 
 def _named_in_form(text: str, beside: str) -> str | None:
@@ -170,12 +148,12 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
     if "rho" in found or _missing_of_a_radiosonde(found):
         return None
     height_name = column_names(table)[table.names.index(found["alt"].column)]
-    is_geometric = bool(_GEOMETRIC & set(height_name.tokens))
+    is_geometric = bool(MARKS["geometric"] & set(height_name.tokens))
     c = {short: to_si(table.numbers(table.names.index(m.column)), m.unit) for short, m in found.items()}
     dew = _dew_point(recogniser)
     height, p = c["alt"], c["pressure"]
     with np.errstate(invalid="ignore"):
-        whole = (height > _LOWEST_M) & (height < _HIGHEST_M) & (p > 0.0)
+        whole = (height > -1000.0) & (height < 2e5) & (p > 0.0)
     height = np.where(whole, height, np.nan)
     up = -np.log(np.where(whole, p, 1.0))
     temperature, filled_t = _between(up, c["temperature"], whole)
@@ -220,7 +198,7 @@ def _missing_of_a_radiosonde(found: dict[str, ColumnProposal]) -> str:
 
 def _moist_density(pressure_pa: FloatArray, temperature_k: FloatArray, dew_point_k: FloatArray) -> FloatArray:
     """Density (n,), kg/m^3, by the gas law with the virtual temperature; dry where the dew point is NaN."""
-    celsius = np.nan_to_num(dew_point_k - _ZERO_C_K, nan=-200.0)
+    celsius = np.nan_to_num(dew_point_k - 273.15, nan=-200.0)
     vapour = np.where(celsius > -150.0, 611.2 * np.exp(17.67 * celsius / np.maximum(celsius + 243.5, 1.0)), 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         dry_part = 1.0 - 0.378 * vapour / pressure_pa
@@ -280,18 +258,18 @@ def _video_of(path: Path, telemetry: Path) -> Video | None:
 def _copy(video: Video) -> None:
     """Copy pictures or film beside their place and rename, so that they are whole or not there."""
     video.place.parent.mkdir(parents=True, exist_ok=True)
-    partial = video.place.with_name(f".partial-{video.place.name}")
     with writing(video.place, "choose a folder that you may write to"):
+        if video.is_film:
+            write_file(video.place, lambda partial: shutil.copyfile(video.source, partial))
+            return
+        partial = video.place.with_name(f".partial-{video.place.name}")
         try:
-            if video.is_film:
-                shutil.copyfile(video.source, partial)
-            else:
-                partial.mkdir()
-                for name in video.names:
-                    shutil.copyfile(video.source / name, partial / name)
+            partial.mkdir()
+            for name in video.names:
+                shutil.copyfile(video.source / name, partial / name)
             partial.replace(video.place)
         finally:
-            partial.unlink(missing_ok=True) if video.is_film else shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
 
 
 def frame_list(
@@ -324,7 +302,7 @@ def frame_list(
     _rename(table, at, bare=pictures is not None)
     names = set(table.cells(at))
     films = [v for v in videos if v.is_film]
-    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= _BELONG * len(names)]
+    folders = [v for v in videos if not v.is_film and len(names & set(v.names)) >= 0.9 * len(names)]
     key, fitting = ("folder", folders) if pictures is not None else ("film", films)
     there = f'"{fitting[0].place.relative_to(folder).as_posix()}"' if len(fitting) == 1 else FILL_IN_TOML
     where = "where the pictures lie" if key == "folder" else "the first frame's number in it is 0"
@@ -343,9 +321,9 @@ def frame_list(
 def _without_list(video: Video, folder: Path) -> str:
     """Return the comment for flight.toml where no list has the times of a video's frames."""
     place = video.place.relative_to(folder).as_posix()
-    what = "is a film" if video.is_film else f"holds {len(video.names)} pictures"
-    frame = "number" if video.is_film else "name"
-    key = "film" if video.is_film else "folder"
+    what, frame, key = f"holds {len(video.names)} pictures", "name", "folder"
+    if video.is_film:
+        what, frame, key = "is a film", "number", "film"
     return (
         f"# QUESTION: {place} {what}; when was each frame taken? A table t_s, frame (its {frame}) is wanted:\n"
         f'# [frames]\n# file = "telemetry/frames.csv"\n# {key} = "{place}"\n'
@@ -356,8 +334,7 @@ def _without_list(video: Video, folder: Path) -> str:
 def _cameras_of(folder: Path, tables: dict[str, Any]) -> list[str]:
     """Names of the cameras in the vehicle file that flight.toml names; none where it cannot be read yet."""
     try:
-        made = read_toml(vehicle_path(str(tables.get("vehicle", "")), folder))
-        return list(made.get("cameras", {}))
+        return list(read_toml(vehicle_path(str(tables.get("vehicle", "")), folder)).get("cameras", {}))
     except (OSError, ValueError):
         return []
 
@@ -368,7 +345,7 @@ def _is_picture(cell: str) -> bool:
 
 def _is_frame_number(table: FreeFormTable, k: int) -> bool:
     values = table.numbers(k)
-    named = set(parse_column_name(table.names[k]).tokens) & _FRAME_TOKENS
+    named = set(parse_column_name(table.names[k]).tokens) & MARKS["frame"]
     return bool(named) and bool((np.isfinite(values) & (values >= 0.0) & (values == np.round(values))).all())
 
 
@@ -406,7 +383,7 @@ class _Delivery:
     daveml: dict[Path, bytes] = field(default_factory=dict)
     files: dict[Path, bytes | str] = field(default_factory=dict)
     vehicle: dict[Path, str] = field(default_factory=dict)
-    skipped: list[Fault] = field(default_factory=list)
+    skipped: list[Issue] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
 
@@ -423,7 +400,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     Raises
     ------
     ConfigError
-        ``flight-file-missing``, or ``file-exists`` where one would be overwritten.
+        ``file-missing``, or ``file-exists`` where one would be overwritten.
     GateError
         Every table file in which no table is found, with the codes of `postflight.intake.stored_tables`.
 
@@ -432,7 +409,7 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
     path = folder / "flight.toml"
     if not path.exists():
         words = f"no flight.toml; make one with `postflight init {folder}`"
-        raise ConfigError(f"{folder}: {words}", code="flight-file-missing")
+        raise ConfigError(f"{folder}: {words}", code="file-missing")
     tables = read_toml(path)
     came = _delivered(files, folder)
     _coefficients(came, folder, tables)
@@ -468,13 +445,9 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
 def _print_placeholders(folder: Path) -> None:
     """Print which values are still to fill in, file by file."""
     still_open = placeholders(folder)
-    by_file: dict[str, list[str]] = {}
-    for words in still_open:
-        file, key = words.split(": key '", 1)
-        by_file.setdefault(file, []).append(key.rsplit("'", 1)[0])
-    for file, keys in by_file.items():
-        console.print(f"[cyan]to fill in[/] {escape(file)}: {escape(', '.join(keys))}", highlight=False)
-    following = f"{len(still_open)} values to fill in. Next: postflight check {folder}"
+    for file, keys in still_open.items():
+        console.print(f"[cyan]to fill in[/] {escape(str(file))}: {escape(', '.join(keys))}", highlight=False)
+    following = f"{sum(map(len, still_open.values()))} values to fill in. Next: postflight check {folder}"
     console.print(escape(following), highlight=False)
 
 
@@ -487,17 +460,17 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
         video = _video_of(file, folder / "telemetry")
         if video is not None:
             if video.is_film and (fault := start_fault(file)):
-                faults.append(Fault(f"{file}: {fault}", fault.code))
+                faults.append(Issue(f"{file}: {fault}", fault.code))
             came.videos.append(video)
             came.skipped += _beside_pictures(file, video)
         elif file.is_dir():
             words = f"{file}: a folder without pictures; name the files in it: {file / '*'}"
-            came.skipped.append(Fault(words, "nothing-to-import"))
-        elif file.suffix.lower() in _DAVEML:
+            came.skipped.append(Issue(words, "nothing-to-import"))
+        elif file.suffix.lower() == ".dml":
             came.daveml[file] = _bytes_of(file)
         elif file.suffix.lower() in _PICTURES:
             words = f"{file}: a picture alone; name the folder that holds a video's pictures"
-            came.skipped.append(Fault(words, "nothing-to-import"))
+            came.skipped.append(Issue(words, "nothing-to-import"))
         else:
             try:
                 came.tables += read_tables(file)
@@ -518,12 +491,12 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     return came
 
 
-def _beside_pictures(folder: Path, video: Video) -> list[Fault]:
+def _beside_pictures(folder: Path, video: Video) -> list[Issue]:
     if video.is_film:
         return []
     others = sorted(p.name for p in folder.iterdir() if p.name not in video.names)
     words = f"{folder}: beside its pictures {', '.join(others[:5])}{' ...' if others[5:] else ''}"
-    return [Fault(words, "no-picture")] if others else []
+    return [Issue(words, "nothing-to-import")] if others else []
 
 
 def _bytes_of(file: Path) -> bytes:
@@ -579,7 +552,7 @@ def _place(folder: Path, table: FreeFormTable) -> Path:
 
 def _proposals(
     came: _Delivery, places: list[Path], folder: Path, tables: dict[str, Any]
-) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Fault]]:
+) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Issue]]:
     """Text to add to flight.toml, what to print, and what of the tables is not used, with why."""
     taken = _sections(tables)
     added, shown, unrecognised, unused_tables = [], [], [], []
@@ -599,7 +572,7 @@ def _proposals(
         for source in found:
             if source.section in taken:
                 words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
-                unused_tables.append(Fault(words, "second-of-its-kind"))
+                unused_tables.append(Issue(words, "given-twice"))
             added.append(section_text(source, file, table.notes, source.section in taken))
             taken.add(source.section)
     listed = "".join(added)
@@ -609,32 +582,32 @@ def _proposals(
     return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown, unused_tables
 
 
-def _not_recognised(table: FreeFormTable, file: str) -> Fault:
+def _not_recognised(table: FreeFormTable, file: str) -> Issue:
     recogniser = Recogniser(table)
     if recogniser.is_sounding():
         without = _missing_of_a_radiosonde({q.short: m for q, m in recogniser.air_columns().items()}) or "three levels"
         words = f"{file}: a sounding, in which {without} is missing; write it into the names of the columns"
-        return Fault(words, "sounding-incomplete")
+        return Issue(words, "column-missing")
     if recogniser.time is None:
-        first = [(name, cells[0]) for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
-        shown = ", ".join(f"'{name}' {cell}" for name, cell in first)
+        first = [f"'{name}' {cells[0]}" for k, name in enumerate(table.names[:3]) if (cells := table.cells(k, 1))]
+        shown = ", ".join(first)
         words = (
             f"{file}: no column of times is recognised, and without one nothing else is (the first row has {shown}); "
             "docs/own-data.md lists the times that are read; or declare its columns in flight.toml"
         )
-        return Fault(words, "not-recognised")
+        return Issue(words, "column-missing")
     words = f"{file}: nothing recognised among {', '.join(table.names)}; declare its columns in flight.toml"
-    return Fault(words, "not-recognised")
+    return Issue(words, "column-missing")
 
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:
     """``[start]`` where accelerometer and gyros with known units and seconds begin with a rest; else nothing."""
-    records = {}
-    for table, found, _ in shown:
-        for source in found:
-            record = _triad_of(table, source)
-            if record is not None:
-                records[source.section] = record
+    records = {
+        source.section: record
+        for table, found, _ in shown
+        for source in found
+        if (record := _triad_of(table, source)) is not None
+    }
     if not {"sensors.accelerometer", "sensors.rates"} <= set(records):
         return ""
     both = records["sensors.accelerometer"], records["sensors.rates"]
@@ -670,10 +643,8 @@ def _earlier_videos(folder: Path) -> list[Video]:
 
 
 def _sections(tables: dict[str, Any]) -> set[str]:
-    out: set[str] = {"atmosphere", "frames"} & set(tables)
-    for group in ("sensors", "radars", "gnss", "barometers"):
-        out |= {f"{group}.{name}" for name in tables.get(group, {})}
-    return out
+    groups = ("sensors", "radars", "gnss", "barometers")
+    return {"atmosphere", "frames"} & set(tables) | {f"{g}.{name}" for g in groups for name in tables.get(g, {})}
 
 
 def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> None:

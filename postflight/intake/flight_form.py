@@ -23,7 +23,7 @@ from rich.markup import escape
 
 from flightmodel.aerodynamics import Sidecar
 from flightmodel.checks import ConfigError
-from flightmodel.config import FILL_IN, FILL_IN_VALUE, read_toml
+from flightmodel.config import FILL_IN_VALUE, read_toml
 from flightmodel.files import write_file
 from flightmodel.flightfolder import FlightFile
 from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
@@ -52,7 +52,7 @@ console = terminal()
 
 
 def template(kind: str) -> str:
-    """Return the text of the form of a ``flight`` or a ``vehicle``."""
+    """Return the text of a form: ``flight``, ``vehicle``, ``coefficients``, ``motion`` or ``attitude_prior``."""
     return (files("postflight.intake") / "templates" / f"{kind}.toml").read_text(encoding="utf-8")
 
 
@@ -120,25 +120,23 @@ def _resolved(made: dict[str, Any], node: dict[str, Any]) -> dict[str, Any]:
 # placeholders
 
 
-def placeholders(folder: Path) -> list[str]:
-    """Return the placeholders of flight.toml, its vehicle file and the coefficients' sidecar, with file and key.
+def placeholders(folder: Path) -> dict[Path, list[str]]:
+    """Return the keys of the placeholders in flight.toml, its vehicle file and the coefficients' sidecar, by file.
 
     Files that cannot be read hold none: they are refused elsewhere.
     """
-    flight = _tables(folder / "flight.toml")
-    out = _placeholders_of(folder / "flight.toml", flight)
-    named = flight.get("vehicle")
-    if not isinstance(named, str) or not named.endswith(".toml"):
-        return out
-    path = vehicle_path(named, folder)
-    vehicle = _tables(path)
-    out += _placeholders_of(path, vehicle)
-    aerodynamics = vehicle.get("aerodynamics")
-    table = aerodynamics.get("table") if isinstance(aerodynamics, dict) else None
-    if isinstance(table, str):
-        sidecar = (path.parent / table).with_suffix(".toml")
-        out += _placeholders_of(sidecar, _tables(sidecar))
-    return out
+    path = folder / "flight.toml"
+    found = {path: _tables(path)}
+    named = found[path].get("vehicle")
+    if isinstance(named, str) and named.endswith(".toml"):
+        path = vehicle_path(named, folder)
+        found[path] = _tables(path)
+        aerodynamics = found[path].get("aerodynamics")
+        table = aerodynamics.get("table") if isinstance(aerodynamics, dict) else None
+        if isinstance(table, str):
+            sidecar = (path.parent / table).with_suffix(".toml")
+            found[sidecar] = _tables(sidecar)
+    return {path: keys for path, tables in found.items() if (keys := list(_open_keys(tables, "")))}
 
 
 def _tables(path: Path) -> dict[str, Any]:
@@ -146,10 +144,6 @@ def _tables(path: Path) -> dict[str, Any]:
         return read_toml(path)
     except (ConfigError, OSError, ValueError):
         return {}
-
-
-def _placeholders_of(path: Path, tables: dict[str, Any]) -> list[str]:
-    return [f"{path}: key '{key}' {FILL_IN}" for key in _open_keys(tables, "")]
 
 
 def _open_keys(value: Any, at: str) -> Iterator[str]:
@@ -211,15 +205,11 @@ def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[st
         Names of files with columns that were recognised as nothing and may be an accelerometer's or gyros'.
     """
     if {"sensors.accelerometer", "sensors.rates"} <= sections:
-        return _ballistic_question(tables) + _attitude_text(tables)
+        return _ballistic_question(tables) + ("" if "attitude_prior" in tables else template("attitude_prior"))
     tracked = any(s.startswith(("radars.", "gnss.")) for s in sections)
     if not tracked or "motion" in tables:
         return ""
-    text = (
-        "[motion]                          # no accelerometer with gyros yet: gravitation and drag carry the flight\n"
-        'model = "ballistic"               # take [motion] out once both are there\n'
-        f"drag_area_per_mass_m2pkg = {FILL_IN_TOML}  # m2/kg: C_D S / m, to a factor of 2.7\n"
-    )
+    text = template("motion")
     if not unrecognised:
         return text
     first = (
@@ -237,20 +227,6 @@ def _ballistic_question(tables: dict[str, Any]) -> str:
     return (
         '# QUESTION: [motion] above has model = "ballistic", so accelerometer and gyros would not carry the flight:\n'
         "# take [motion] out, unless that is meant.\n"
-    )
-
-
-def _attitude_text(tables: dict[str, Any]) -> str:
-    if "attitude_prior" in tables:
-        return ""
-    return (
-        "[attitude_prior]                  # attitude at one time, by three angles or q_ecef_body, scalar first\n"
-        f"t_s = {FILL_IN_TOML}                   # s after t0\n"
-        f"azimuth_deg = {FILL_IN_TOML}           # deg from true north: where the nose points\n"
-        f"elevation_deg = {FILL_IN_TOML}         # deg above the horizon\n"
-        f"roll_deg = {FILL_IN_TOML}              # deg; at 0 body y is level, to the right of one who looks along x\n"
-        "# q_ecef_body = [1.0, 0.0, 0.0, 0.0]  # instead of these three: body to ECEF, scalar FIRST, e.g.\n"
-        "sd_deg = 3.0                      # deg, one number or one for body x, y, z\n"
     )
 
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 import csv
 import io
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -61,10 +63,8 @@ class FreeFormTable:
 
     def numbers(self, column: int) -> FloatArray:
         """Return a column (n,) as float64; what is no number is NaN."""
-        out = np.full(len(self.rows), np.nan)
-        for k, row in enumerate(self.rows):
-            if column < len(row):
-                out[k] = plain_number(row[column])
+        cells = (row[column] if column < len(row) else "" for row in self.rows)
+        out = np.array([plain_number(cell) for cell in cells], dtype=float)
         return np.where(np.abs(out) < _LARGEST, out, np.nan)
 
     def cells(self, column: int, rows: int | None = None) -> list[str]:
@@ -82,21 +82,28 @@ class FreeFormTable:
         return out.getvalue().encode()
 
 
+@contextmanager
+def refusing_unfit(path: Path) -> Iterator[None]:
+    """Turn what a file cannot be opened for into a `GateError`: it is missing, too large, or none."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise GateError(f"{path}: {nothing_at(path)}", code="file-missing") from None
+    except UnfitFile as fault:
+        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
+
+
 def read_text_table(path: Path) -> FreeFormTable:
     """Read one text table.
 
     Raises
     ------
     GateError
-        ``table-missing`` where no names above three rows of numbers are found, ``table-too-large``,
-        ``table-binary``, or ``file-missing``.
+        ``file-unreadable`` where no names above three rows of numbers are found, ``file-too-large``,
+        ``file-unreadable``, or ``file-missing``.
     """
-    try:
+    with refusing_unfit(path):
         raw = file_bytes(path)
-    except FileNotFoundError:
-        raise GateError(f"{path}: {nothing_at(path)}", code="file-missing") from None
-    except UnfitFile as fault:
-        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
     text, notes = _decoded(path, raw)
     table = table_of_lines([line for line in text.splitlines() if line.strip()], path.stem, str(path), notes)
     plain = not table.notes and all(len(r) == len(table.names) for r in table.rows)
@@ -119,7 +126,7 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     Raises
     ------
     GateError
-        ``table-missing`` where no names above three rows of numbers are found.
+        ``file-unreadable`` where no names above three rows of numbers are found.
     """
     ruled = _ruled(label, lines)
     if ruled is not None:
@@ -128,7 +135,7 @@ def table_of_lines(lines: list[str], label: str, where: str, notes: list[str]) -
     found = _layout(lines[:_HEAD_LINES])
     if found is None:
         words = "no table found: a line of names, three rows of numbers below it and one delimiter are wanted"
-        raise GateError(f"{where}: {words}", code="table-missing")
+        raise GateError(f"{where}: {words}", code="file-unreadable")
     delimiter, first, header, unit_row = found
     names = [n.strip() for n in header]
     units = [u.strip() for u in unit_row] if unit_row else [""] * len(names)
@@ -188,7 +195,7 @@ def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
         return raw.decode("utf-16", errors="replace"), ["UTF-16 became UTF-8"]
     if b"\0" in raw[:65536]:
-        raise GateError(f"{path}: binary data where a text table is wanted", code="table-binary")
+        raise GateError(f"{path}: binary data where a text table is wanted", code="file-unreadable")
     try:
         return raw.decode("utf-8-sig"), []
     except UnicodeDecodeError:
@@ -221,12 +228,9 @@ def _layout(lines: list[str]) -> tuple[str | None, int, list[str], list[str]] | 
         cut = [_split(line, delimiter) for line in lines]
         for first in range(1, len(lines) - 2):
             three = cut[first : first + 3]
-            same = len({len(c) for c in three}) == 1
-            if (
-                not same
-                or not all(_is_data(c) for c in three)
-                or any(_is_comment(x, delimiter) for x in lines[first : first + 3])
-            ):
+            if len({len(c) for c in three}) > 1 or not all(map(_is_data, three)):
+                continue
+            if any(_is_comment(line, delimiter) for line in lines[first : first + 3]):
                 continue
             named = _names_above(lines, cut, first, delimiter)
             if named and (best is None or len(three[0]) > len(best[2])):

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flightmodel import earth, rotations, tables
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import undulation_m
 from flightmodel.files import UnfitFile, file_bytes
@@ -38,9 +38,6 @@ _LARGEST = 1e100  # what is beyond is a broken word
 _NEAR_M = 6.2e6, 1e9  # from the Earth's centre: no flight is below, none that is compared beyond
 _DAY_OF_YEAR = re.compile(r"(\d{4})-(\d{3})T(.*)")
 _POSITIONS = (tuple(f"r{a}_ecef_m" for a in "xyz"), tuple(f"{a}_ecef_m" for a in "xyz"))
-_GEODETIC = ("lat_deg", "lon_deg", "alt_m")
-_VELOCITY = tuple(f"v{a}_ecef_mps" for a in "xyz")
-_NED = tuple(f"v{a}_mps" for a in "ned")
 _ATTITUDES = (tuple(f"q{a}_ecef_body" for a in "wxyz"), tuple(f"q{a}" for a in "wxyz"))
 _SD = (
     *(f"r{a}_ecef_sd_m" for a in "xyz"),
@@ -80,6 +77,14 @@ class OtherTrajectory:
     covariance: FloatArray
     notes: tuple[str, ...]
 
+    def part(self, keep: BoolArray, left_out: str) -> OtherTrajectory:
+        """States of a mask (n,), with a note of what is left out where that is any; covariances stay."""
+        if keep.all():
+            return self
+        columns = ("time_s", "position_ecef_m", "velocity_ecef_mps", "q_ecef_body")
+        kept = {name: values[keep] for name in columns if (values := getattr(self, name)) is not None}
+        return replace(self, **kept, notes=(*self.notes, left_out))
+
 
 def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     """Read another source's trajectory.
@@ -93,9 +98,9 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     Raises
     ------
     GateError
-        What `read_tables` refuses; ``oem-syntax``, ``oem-frame``, ``oem-time-system``; ``no-trajectory`` where no table
-        holds times and positions, ``unit-missing`` where a column's unit is not stated, ``position-range``,
-        ``time-order``.
+        What `read_tables` refuses; ``oem-frame``; ``file-unreadable`` where no table
+        holds times and positions, ``unit-unknown`` where a column's unit is not stated, ``value-range``,
+        ``time-backwards``.
     """
     try:
         content = file_bytes(path)
@@ -108,7 +113,7 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
     found = _near_earth(path, found)
     if len(found.time_s) < LEAST_ROWS or (np.diff(found.time_s) <= 0.0).any():
         words = f"{LEAST_ROWS} states in the order of their times are wanted, each time once"
-        raise GateError(f"{path}: {words}", "time-order")
+        raise GateError(f"{path}: {words}", "time-backwards")
     return found
 
 
@@ -116,21 +121,10 @@ def _near_earth(path: Path, found: OtherTrajectory) -> OtherTrajectory:
     """Leave out states whose place is none of a flight, and say so."""
     distance_m = np.linalg.norm(found.position_ecef_m, axis=1)
     keep = (distance_m > _NEAR_M[0]) & (distance_m < _NEAR_M[1])
-    if keep.all():
-        return found
-    if not keep.any():
+    if len(keep) and not keep.any():
         words = f"positions are {np.median(distance_m):.4g} m from the Earth's centre: of another unit or frame"
-        raise GateError(f"{path}: {words}", "position-range")
-    words = f"{int((~keep).sum())} of {len(keep)} states in the Earth or far from it are left out"
-    velocity, attitude = found.velocity_ecef_mps, found.q_ecef_body
-    return replace(
-        found,
-        time_s=found.time_s[keep],
-        position_ecef_m=found.position_ecef_m[keep],
-        velocity_ecef_mps=None if velocity is None else velocity[keep],
-        q_ecef_body=None if attitude is None else attitude[keep],
-        notes=(*found.notes, words),
-    )
+        raise GateError(f"{path}: {words}", "value-range")
+    return found.part(keep, f"{int((~keep).sum())} of {len(keep)} states in the Earth or far from it are left out")
 
 
 # CCSDS OEM
@@ -153,7 +147,7 @@ def _read_oem(path: Path, text: str, epoch: datetime) -> OtherTrajectory:
             faults.append(GateError(f"{path}: line {line}: {words}", "oem-frame").faults[0])
         if key == "TIME_SYSTEM" and value.upper() != "UTC":
             words = f"TIME_SYSTEM = {value}; UTC is wanted (GPS is 18 s ahead of it since 2017)"
-            faults.append(GateError(f"{path}: line {line}: {words}", "oem-time-system").faults[0])
+            faults.append(GateError(f"{path}: line {line}: {words}", "oem-frame").faults[0])
     if faults:
         raise GateError(faults)
     rows = []
@@ -168,13 +162,11 @@ def _read_oem(path: Path, text: str, epoch: datetime) -> OtherTrajectory:
     table = np.array(rows, dtype=float).reshape(-1, 7)
     first = np.append(True, np.diff(table[:, 0]) != 0.0)[: len(table)]  # segments share their ends
     times, covariance, skipped = _oem_covariances(path, message, epoch)
-    notes = [f"{skipped} covariances in another frame than the states' are left out"] if skipped else []
-    if not first.all():
-        notes.append(f"{int((~first).sum())} states at the time of the one before are left out")
-        table = table[first]
-    return OtherTrajectory(
-        path.name, table[:, 0], 1e3 * table[:, 1:4], 1e3 * table[:, 4:7], None, times, covariance, tuple(notes)
+    notes = (f"{skipped} covariances in another frame than the states' are left out",) if skipped else ()
+    found = OtherTrajectory(
+        path.name, table[:, 0], 1e3 * table[:, 1:4], 1e3 * table[:, 4:7], None, times, covariance, notes
     )
+    return found.part(first, f"{int((~first).sum())} states at the time of the one before are left out")
 
 
 def _oem_lines(path: Path, text: str) -> _Oem:
@@ -224,14 +216,14 @@ def _oem_covariances(path: Path, message: _Oem, epoch: datetime) -> tuple[FloatA
             times.append(_seconds(stamp, epoch))
         except ValueError:
             raise GateError(
-                f"{path}: covariance at {stamp}: six rows of 1 to 6 numbers are wanted", "oem-syntax"
+                f"{path}: covariance at {stamp}: six rows of 1 to 6 numbers are wanted", "file-unreadable"
             ) from None
         matrices.append(1e6 * (matrix + np.tril(matrix, -1).T))
     return np.array(times), np.array(matrices).reshape(-1, 6, 6), skipped
 
 
 def _oem_syntax(path: Path, line: int, words: str) -> GateError:
-    return GateError(f"{path}: line {line}: {words}", "oem-syntax")
+    return GateError(f"{path}: line {line}: {words}", "file-unreadable")
 
 
 def _seconds(stamp: str, epoch: datetime) -> float:
@@ -254,12 +246,12 @@ def _read_table(path: Path, epoch: datetime) -> OtherTrajectory:
         if found is not None:
             return found
     if refused:
-        raise GateError(f"{path}: {'; '.join(refused)}", "unit-missing")
+        raise GateError(f"{path}: {'; '.join(refused)}", "unit-unknown")
     words = (
         "no table with times and positions: t_s or utc; x_ecef_m, y_ecef_m, z_ecef_m or lat_deg, lon_deg, alt_m; "
         "and if known vx_ecef_mps ... or vn_mps, ve_mps, vd_mps, and qw_ecef_body ... (columns of bet.csv)"
     )
-    raise GateError(f"{path}: {words}", "no-trajectory")
+    raise GateError(f"{path}: {words}", "file-unreadable")
 
 
 def _columns(table: FreeFormTable, names: tuple[str, ...]) -> FloatArray | None:
@@ -273,7 +265,7 @@ def _by_name(path: Path, table: FreeFormTable, epoch: datetime) -> OtherTrajecto
     """What a table with the columns of ``bet.csv`` holds; None for any other."""
     notes = list(table.notes)
     position = next((p for names in _POSITIONS if (p := _columns(table, names)) is not None), None)
-    geodetic = _columns(table, _GEODETIC)
+    geodetic = _columns(table, ("lat_deg", "lon_deg", "alt_m"))
     if position is None and geodetic is not None:
         notes.append("alt_m is taken above the ellipsoid")
         latitude, longitude = np.deg2rad(geodetic[:, :2]).T
@@ -281,7 +273,8 @@ def _by_name(path: Path, table: FreeFormTable, epoch: datetime) -> OtherTrajecto
     time_s = _times(table, epoch, notes)
     if position is None or time_s is None:
         return None
-    velocity, ned = _columns(table, _VELOCITY), _columns(table, _NED)
+    velocity = _columns(table, tuple(f"v{a}_ecef_mps" for a in "xyz"))
+    ned = _columns(table, tuple(f"v{a}_mps" for a in "ned"))
     if velocity is None and ned is not None:
         velocity = earth.ecef_from_ned(ned, position)
     attitude = next((q for names in _ATTITUDES if (q := _columns(table, names)) is not None), None)
@@ -326,26 +319,18 @@ def _assembled(
     velocity, attitude = (None if v is None or not np.isfinite(v).any() else v for v in (velocity, attitude))
     parts = [position, *(v for v in (velocity, attitude) if v is not None)]
     keep = np.isfinite(time_s) & np.isfinite(np.column_stack(parts)).all(axis=1)
-    if not keep.all():
-        notes.append(f"{int((~keep).sum())} of {len(keep)} rows are not whole and left out")
-    times, covariance = np.empty(0), np.empty((0, 6, 6))
+    found = OtherTrajectory(
+        path.name, time_s, position, velocity, attitude, np.empty(0), np.empty((0, 6, 6)), tuple(notes)
+    ).part(keep, f"{int((~keep).sum())} of {len(keep)} rows are not whole and left out")
     if sd is not None and sd.shape[1] >= 6:
         known = keep & np.isfinite(sd).all(axis=1)
-        times, covariance = time_s[known], np.einsum("ni,ij->nij", sd[known] ** 2, np.eye(sd.shape[1]))
-        notes.append("standard deviations are stated, their correlations are not")
-    if attitude is not None:
-        attitude = attitude[keep]
-        attitude = rotations.continuous(attitude / np.linalg.norm(attitude, axis=1, keepdims=True))
-    return OtherTrajectory(
-        path.name,
-        time_s[keep],
-        position[keep],
-        None if velocity is None else velocity[keep],
-        attitude,
-        times,
-        covariance,
-        tuple(notes),
-    )
+        covariance = np.einsum("ni,ij->nij", sd[known] ** 2, np.eye(sd.shape[1]))
+        words = "standard deviations are stated, their correlations are not"
+        found = replace(found, covariance_time_s=time_s[known], covariance=covariance, notes=(*found.notes, words))
+    if found.q_ecef_body is not None:
+        q = found.q_ecef_body
+        found = replace(found, q_ecef_body=rotations.continuous(q / np.linalg.norm(q, axis=1, keepdims=True)))
+    return found
 
 
 def _by_vocabulary(path: Path, table: FreeFormTable, epoch: datetime, refused: list[str]) -> OtherTrajectory | None:

@@ -32,13 +32,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel.checks import ConfigError, FloatArray, GateError
-from flightmodel.files import TABLE_BYTES, UnfitFile, nothing_at, open_file
-from postflight.intake.freeform_tables import LEAST_ROWS, FreeFormTable, read_text_table, table_of_lines
+from flightmodel.files import TABLE_BYTES, open_file
+from postflight.intake.freeform_tables import (
+    LEAST_ROWS,
+    FreeFormTable,
+    read_text_table,
+    refusing_unfit,
+    table_of_lines,
+)
 
 _MOST_NUMBERS = 200_000_000  # of a file
-_HEAD = 1024  # bytes: MATLAB 7.3 has HDF5's mark behind a preface of 512
-_HDF5, _ZIP, _OLD_OFFICE = b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", b"\xd0\xcf\x11\xe0"
-_CLASSIC = (b"\x01", b"\x02")  # versions that scipy reads
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 EXTRAS = {"openpyxl": "excel", "pyarrow": "parquet", "h5py": "matlab"}
 _ERRORS = {"#DIV/0!", "#N/A", "#NAME?", "#NULL!", "#NUM!", "#REF!", "#VALUE!"}  # of a spreadsheet: no value there
 _UNITS, _NAMES = ("units", "unit"), ("names", "columns", "channels", "labels", "variables")
@@ -71,15 +75,15 @@ if file.metadata.num_rows * file.metadata.num_columns <= {_MOST_NUMBERS}:
     file.read()
 """,
 }
-_STEP_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "m": 60.0, "h": 3600.0, "d": 86400.0}
-_STEPS = {
-    **dict.fromkeys(("s", "sec", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("min", "minute", "minutes"), "m"),
-    **dict.fromkeys(("h", "hr", "hour", "hours"), "h"),
-    **dict.fromkeys(("d", "day", "days"), "d"),
-}
+_STEP_S = {
+    word: step_s
+    for step_s, words in (
+        (86400.0, "d day days"), (3600.0, "h hr hour hours"), (60.0, "min minute minutes"),
+        (1.0, "s sec second seconds"), (1e-3, "ms msec millisecond milliseconds"),
+        (1e-6, "us microsecond microseconds"),
+    )
+    for word in words.split()
+}  # fmt: skip
 _PACKED = {"scale_factor": 1.0, "add_offset": 0.0}  # and what they are where they are not stated
 _CALENDARS = {"", "standard", "gregorian", "proleptic_gregorian"}
 Column = tuple[str, str, NDArray[Any]]  # name, unit, values (n,): numbers or texts
@@ -92,31 +96,26 @@ def read_tables(path: Path) -> list[FreeFormTable]:
     Raises
     ------
     GateError
-        ``file-missing``, ``table-missing``, ``table-too-large``, ``table-unreadable`` (``matlab-unreadable``),
-        ``table-old-excel``, and what `read_text_table` refuses.
+        ``file-missing``, ``file-unreadable``, ``file-too-large``, ``file-unreadable`` (``file-unreadable``),
+        ``file-unreadable``, and what `read_text_table` refuses.
     ConfigError
-        ``library-missing`` (``h5py-missing`` for MATLAB) with the command that installs the library.
+        ``package-missing`` (``package-missing`` for MATLAB) with the command that installs the library.
     """
-    try:
-        with open_file(path) as file:
-            head = file.read(_HEAD)
-    except FileNotFoundError:
-        raise GateError(f"{path}: {nothing_at(path)}", code="file-missing") from None
-    except UnfitFile as fault:
-        raise GateError(f"{path}: {fault.strerror}", fault.code) from None
+    with refusing_unfit(path), open_file(path) as file:
+        head = file.read(1024)  # MATLAB 7.3 has HDF5's mark behind a preface of 512
     if path.suffix.lower() == ".mat":
         version = _version_73 if b"MATLAB 7.3" in head or _HDF5 in head else _version_5
-        return _guarded(path, lambda path: _matlab(path, version(path)), "matlab-unreadable", "h5py-missing")
-    if head.startswith(_OLD_OFFICE):
+        return _guarded(path, lambda path: _matlab(path, version(path)), "file-unreadable", "package-missing")
+    if head.startswith(b"\xd0\xcf\x11\xe0"):
         words = "a spreadsheet in the format of before 2007; save it as .xlsx or CSV"
-        raise GateError(f"{path}: {words}", code="table-old-excel")
-    if head.startswith(_ZIP) and _is_workbook(path):
+        raise GateError(f"{path}: {words}", code="file-unreadable")
+    if head.startswith(b"PK\x03\x04") and _is_workbook(path):
         return _guarded(path, _workbook)
     if head.startswith(b"PAR1"):
         return _guarded(path, _parquet)
     if head.startswith(b"CDF"):
-        if head[3:4] not in _CLASSIC:
-            raise GateError(f"{path}: NetCDF in 64-bit data format; store it as version 4", code="table-unreadable")
+        if head[3:4] not in (b"\x01", b"\x02"):  # versions that scipy reads
+            raise GateError(f"{path}: NetCDF in 64-bit data format; store it as version 4", code="file-unreadable")
         return _guarded(path, _netcdf_classic)
     if _HDF5 in head:
         return _guarded(path, _netcdf_4)
@@ -126,8 +125,8 @@ def read_tables(path: Path) -> list[FreeFormTable]:
 def _guarded(
     path: Path,
     read: Callable[[Path], list[FreeFormTable]],
-    unreadable: str = "table-unreadable",
-    missing: str = "library-missing",
+    unreadable: str = "file-unreadable",
+    missing: str = "package-missing",
 ) -> list[FreeFormTable]:
     """Tables of a file; whatever a library says of a damaged one becomes a refusal with the code ``unreadable``."""
     try:
@@ -135,22 +134,22 @@ def _guarded(
     except GateError:
         raise
     except ImportError as fault:
-        raise _missing(path, fault, missing) from None
+        raise ConfigError(f"{path}: {missing_library(fault)}, or store it as CSV", code=missing) from None
     except Exception as fault:  # each library has its own
         words = f"cannot be read ({type(fault).__name__}: {fault}); store it again, or as CSV"
         raise GateError(f"{path}: {words}", code=unreadable) from None
     if not tables:
         words = f"no table found: two columns of numbers of one length, {LEAST_ROWS} rows at least, are wanted"
-        raise GateError(f"{path}: {words}", code="table-missing")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
     return tables
 
 
-def _missing(path: Path, fault: ImportError, code: str) -> ConfigError:
+def missing_library(fault: ImportError) -> str:
+    """What installs the optional library that could not be imported, in words; any other fault is raised again."""
     name = (fault.name or "").partition(".")[0]
     if name not in EXTRAS:
         raise fault
-    words = f"needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]', or store it as CSV"
-    return ConfigError(f"{path}: {words}", code=code)
+    return f"needs {name}, which is not installed: pip install 'postflight[{EXTRAS[name]}]'"
 
 
 def _check_readable(path: Path, kind: str) -> None:
@@ -166,12 +165,12 @@ def _check_readable(path: Path, kind: str) -> None:
         words = (
             f"a damaged file: the library for {kind} {fate}; compare its checksum with the sender's, or have it as CSV"
         )
-        raise GateError(f"{path}: {words}", code="table-unreadable")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
 
 
 def _check_size(path: Path, numbers: int) -> None:
     if numbers > _MOST_NUMBERS:
-        raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="table-too-large")
+        raise GateError(f"{path}: more than {_MOST_NUMBERS} numbers; split it", code="file-too-large")
 
 
 def _cells(values: NDArray[Any]) -> list[str]:
@@ -210,7 +209,7 @@ def _workbook(path: Path) -> list[FreeFormTable]:
 
     with zipfile.ZipFile(path) as archive:
         if sum(part.file_size for part in archive.infolist()) > TABLE_BYTES:
-            raise GateError(f"{path}: unpacks to more than {TABLE_BYTES} bytes; split it", code="table-too-large")
+            raise GateError(f"{path}: unpacks to more than {TABLE_BYTES} bytes; split it", code="file-too-large")
     book = openpyxl.load_workbook(path, read_only=True, data_only=True, keep_links=False)
     tables, without = [], []
     try:
@@ -375,7 +374,7 @@ def _since(values: NDArray[Any], step: str, epoch: str) -> NDArray[Any] | None:
     """Times (n,) of ``seconds since 2009-08-17 12:52:00``; None where step or epoch cannot be read."""
     try:
         start = np.datetime64(epoch.strip().rstrip("Z").replace(" ", "T"), "us")
-        microseconds = np.asarray(values, dtype=float) * _STEP_S[_STEPS[step]] * 1e6
+        microseconds = np.asarray(values, dtype=float) * _STEP_S[step] * 1e6
     except (ValueError, KeyError):
         return None
     known = np.isfinite(microseconds)
@@ -405,7 +404,7 @@ def _matlab(path: Path, tree: Tree) -> list[FreeFormTable]:
         tables.append(_table(label, columns, ["MATLAB numbers became CSV"], left_out))
     if not tables:
         words = f"no two columns of numbers of one length; left out: {', '.join(left_out) or 'nothing'}"
-        raise GateError(f"{path}: {words}", code="table-missing")
+        raise GateError(f"{path}: {words}", code="file-unreadable")
     return tables
 
 

@@ -74,14 +74,7 @@ def write_chunk(folder: Path, number: int, chunk: Chunk) -> None:
     reasons = "\0".join(chunk.reasons).encode()
     try:
         with partial.open("wb") as file:
-            np.savez(
-                file,
-                runs=chunk.runs,
-                reasons=np.frombuffer(reasons, dtype=np.uint8),
-                diverged_s=chunk.diverged_s,
-                scalars=chunk.scalars,
-                histories=chunk.histories,
-            )
+            np.savez(file, **(vars(chunk) | {"reasons": np.frombuffer(reasons, dtype=np.uint8)}))
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
@@ -101,8 +94,6 @@ def read_chunk(folder: Path, number: int, runs: Sequence[int] | None = None, his
             reasons = tuple(data["reasons"].tobytes().decode().split("\0"))
             past = data["histories"] if histories else np.empty((len(held), 0, 0), dtype=np.float32)
             chunk = Chunk(held, reasons, data["diverged_s"], data["scalars"], past)
-    except FileNotFoundError:
-        return None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     if len(reasons) != len(held) or (runs is not None and held.tolist() != list(runs)):
@@ -143,7 +134,6 @@ def is_narrow(values: FloatArray, percentile: float, confidence: float, width: f
 
 
 BAND_BYTES = 64 * 1024**2
-DIGITS = "%.10g"
 
 
 @dataclass(frozen=True)
@@ -171,7 +161,7 @@ def merge(study: Study, folder: Path, flights: int) -> Merged:
         if chunk is None:
             missing = sum(read_chunk(folder, j, r, False) is None for j, r in enumerate(wanted))
             message = f"{folder}: {missing} of {len(wanted)} chunks are missing; the same run command flies them"
-            raise GateError(message, code="chunk-missing")
+            raise GateError(message, code="study-damaged")
         parts.append(chunk)
     names = list(study.plan.scalars)
     table = pd.DataFrame(np.concatenate([c.scalars for c in parts]), columns=names)
@@ -238,21 +228,15 @@ def _slabs(
     at_once = max(1, BAND_BYTES // (4 * names * points * max(len(runs) for runs in wanted)))
     path = partial_path(folder / "histories")
     try:
-        with path.open("w+b") as file:
-            before = 0
-            for first in range(0, len(wanted), at_once):
-                block = _turned(folder, wanted[first : first + at_once], first, (names, points))
-                for row, values in enumerate(values for history in block for values in history):
-                    file.seek(4 * (row * count + before))
-                    file.write(values.tobytes())
-                before += block.shape[2]
-            for at in range(0, points, width):
-                part = slice(at, min(at + width, points))
-                slab = np.empty((names, part.stop - at, count), dtype=np.float32)
-                for k in range(names):
-                    file.seek(4 * (k * points + at) * count)
-                    slab[k] = np.fromfile(file, np.float32, slab[k].size).reshape(slab[k].shape)
-                yield part, slab
+        turned, before = np.memmap(path, np.float32, "w+", shape=shape), 0
+        for first in range(0, len(wanted), at_once):
+            block = _turned(folder, wanted[first : first + at_once], first, (names, points))
+            turned[:, :, before : before + block.shape[2]] = block
+            before += block.shape[2]
+        for at in range(0, points, width):
+            part = slice(at, min(at + width, points))
+            yield part, turned[:, part]
+        del turned
     finally:
         path.unlink(missing_ok=True)
 
@@ -264,7 +248,7 @@ def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tu
         chunk = read_chunk(folder, number, runs)
         if chunk is None:
             message = f"{folder}: chunk {number} was damaged while it was read; run again"
-            raise GateError(message, code="chunk-damaged")
+            raise GateError(message, code="study-damaged")
         kept = chunk.histories[chunk.flown]
         out[:, :, count : count + len(kept)] = np.moveaxis(kept, 0, -1)
         count += len(kept)
@@ -295,15 +279,11 @@ def coverage(table: pd.DataFrame) -> dict[str, dict[str, float]]:
 
 def write_merged(folder: Path, merged: Merged) -> None:
     """Write the tables and the counts, each whole or not at all; the same bytes from the same chunks."""
-    for name, table in (
-        ("flights.csv", merged.flights),
-        ("percentiles.csv", merged.percentiles),
-        ("bands.csv", merged.bands),
-    ):
-        write_csv(folder / name, table)
+    for name in ("flights", "percentiles", "bands"):
+        write_csv(folder / f"{name}.csv", getattr(merged, name))
     write_file(folder / "summary.json", json.dumps(merged.summary, indent=2) + "\n")
 
 
 def write_csv(path: Path, table: pd.DataFrame) -> None:
     """Write a table beside its place and rename it."""
-    write_file(path, lambda partial: table.to_csv(partial, index=False, float_format=DIGITS, lineterminator="\n"))
+    write_file(path, lambda partial: table.to_csv(partial, index=False, float_format="%.10g", lineterminator="\n"))

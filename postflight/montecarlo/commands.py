@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import ConfigError, GateError
 from postflight.commands import compile_kernels, console
 from postflight.montecarlo import execution
-from postflight.montecarlo.bands import Merged, merge, write_csv, write_merged
+from postflight.montecarlo.bands import Merged, merge, write_merged
 from postflight.montecarlo.execution import Wanted
-from postflight.montecarlo.study import Stop, Study, indices, read_study, sobol_study
-from postflight.plots.studies import figure_bands, figure_sobol
+from postflight.montecarlo.study import Stop, Study, read_study
+from postflight.plots.studies import figure_bands
 from postflight.plots.style import draw
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
@@ -23,11 +21,12 @@ from synthetic_flight.ensemble import available_cores, check_outputs
 
 
 def run(
-    name: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None, until: str | None
-) -> None:
+    dispersions: str, folder: Path, flights: int | None, workers: int | None, scheduler: str | None,
+    until_width: str | None,
+) -> None:  # fmt: skip
     """Fly what is missing and merge."""
-    study = read_study(name)
-    stop = study.spec.stop if until is None else stop_from(until, study)
+    study = read_study(dispersions)
+    stop = study.spec.stop if until_width is None else stop_from(until_width, study)
     wanted = Wanted(flights or study.spec.flights, workers or available_cores(), scheduler, stop)
     count = fly(study, folder, wanted)
     finish(study, folder, count)
@@ -57,7 +56,7 @@ def fly(study: Study, folder: Path, wanted: Wanted) -> int:
     compile_kernels("simulator", "ensembles", *(RECONSTRUCTION if study.spec.mode == "whole" else ()))
     if wanted.scheduler is not None and execution.is_open(wanted.scheduler):
         words = f"--scheduler {wanted.scheduler}: not encrypted, and whoever reaches its port can run code there; use tls://"
-        console.coded("[yellow]found[/]", words, "scheduler-open")
+        console.coded("[yellow]found[/]", words, "scheduler-unreachable")
     try:
         with progress_bar() as report:
             return execution.run(study, folder, wanted, report)
@@ -87,14 +86,12 @@ def _origin(study: Study) -> str:
 
 def _print_merged(merged: Merged, folder: Path) -> None:
     """Percentiles with their intervals, and what failed."""
-    table = Table(title=f"{merged.summary['flights']} flights: percentiles")
-    for name in ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last"):
-        table.add_column(name, justify="left" if name == "output" else "right", no_wrap=name == "output")
-    for output, rows in merged.percentiles.groupby("output", sort=False):
-        last = rows.iloc[-1]
-        ends = (f"{'open' if np.isnan(x) else f'{x:.4g}'}" for x in (last["low_95"], last["high_95"]))
-        table.add_row(escape(str(output)), *(f"{value:.4g}" for value in rows["value"]), " to ".join(ends))
-    console.print(table)
+    rows = []
+    for output, band in merged.percentiles.groupby("output", sort=False):
+        ends = ("open" if np.isnan(x) else f"{x:.4g}" for x in band.iloc[-1][["low_95", "high_95"]])
+        rows.append((output, *(f"{value:.4g}" for value in band["value"]), " to ".join(ends)))
+    names = ("output", "2.3 %", "50 %", "97.7 %", "95 % interval of the last")
+    console.table(f"{merged.summary['flights']} flights: percentiles", names, rows)
     for name, row in merged.summary.get("coverage", {}).items():
         console.print(f"{name}: " + ", ".join(f"{key} {value:.3g}" for key, value in row.items()), highlight=False)
     if merged.summary["diverged"]:
@@ -108,11 +105,8 @@ def _print_merged(merged: Merged, folder: Path) -> None:
 def status(folder: Path) -> None:
     """Print how many flights of a folder are flown."""
     found = execution.status(folder)
-    console.print(
-        f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks; "
-        f"{found.failed.total()} failed, {found.diverged} diverged",
-        highlight=False,
-    )
+    flown = f"{found.flights} of {found.flights_wanted} flights in {found.chunks} of {found.chunks_wanted} chunks"
+    console.print(f"{flown}; {found.failed.total()} failed, {found.diverged} diverged", highlight=False)
     for reason, count in found.failed.most_common(5):
         console.print(f"[red]failed[/] {count} times: {escape(reason)}")
 
@@ -120,7 +114,7 @@ def status(folder: Path) -> None:
 def remerge(folder: Path) -> None:
     """Merge the chunks of a folder again."""
     study, flights = execution.study_of(folder)
-    finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
+    finish(study, folder, flights)
 
 
 def retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> None:
@@ -131,55 +125,4 @@ def retry_failed(folder: Path, workers: int | None, scheduler: str | None) -> No
     with progress_bar() as report:
         tried, still = execution.retry_failed(study, folder, wanted, report)
     console.print(f"{tried} failed flights flown again, {still} fail again", highlight=False)
-    finish_sobol(study, folder) if study.design is not None else finish(study, folder, flights)
-
-
-def sobol_indices(
-    name: str, folder: Path, output: str, base: int, by: str, workers: int | None, scheduler: str | None
-) -> None:
-    """Fly Saltelli's design and print the indices of every output; draw those of ``output``."""
-    study = sobol_study(read_study(name), by, base)
-    check_outputs((output,), study.plan.scalars)
-    assert study.design is not None
-    fly(study, folder, Wanted(study.design.flights, workers or available_cores(), scheduler))
-    finish_sobol(study, folder, output)
-
-
-def finish_sobol(study: Study, folder: Path, output: str | None = None) -> None:
-    """Write indices of every output, draw and print those of one: that which is asked for, or the first."""
-    design = study.design
-    assert design is not None
-    merged = merge(study, folder, design.flights)
-    tables = []
-    for name in study.plan.scalars:
-        try:
-            table, left_out = indices(design, merged.flights[name].to_numpy(dtype=float))
-        except GateError as fault:
-            console.print(f"[yellow]left out[/] {escape(name)}: {escape(str(fault))}")
-            continue
-        table.insert(0, "output", name)
-        table["points"] = design.base - left_out
-        tables.append(table)
-    if not tables:
-        raise GateError(f"{folder}: no output has indices", code="sobol-spread")
-    every = pd.concat(tables, ignore_index=True)
-    write_merged(folder, merged)
-    write_csv(folder / "sobol.csv", every)
-    shown = every[every["output"] == (output or every["output"].iloc[0])]
-    if shown.empty:
-        raise GateError(f"{folder}: {output} has no indices", code="sobol-spread")
-    title = f"Sobol indices of {shown['output'].iloc[0]}: {design.flights} flights"
-    draw(folder / "sobol.png", figure_sobol, shown, title, _origin(study))
-    printed = Table(title=title)
-    for head in ("factor", "first order", "95 %", "total", "95 %"):
-        printed.add_column(head, justify="left" if head == "factor" else "right", no_wrap=head == "factor")
-    for r in shown.sort_values("total", ascending=False, kind="stable").itertuples():
-        printed.add_row(
-            r.factor,
-            f"{r.first:.3f}",
-            f"{r.first_low_95:.3f} to {r.first_high_95:.3f}",
-            f"{r.total:.3f}",
-            f"{r.total_low_95:.3f} to {r.total_high_95:.3f}",
-        )
-    console.print(printed)
-    console.print(f"results in {escape(str(folder))}")
+    finish(study, folder, flights)

@@ -12,20 +12,14 @@ resumes it.
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-import signal
-import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from itertools import islice
-from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -34,6 +28,7 @@ import numpy as np
 
 from flightmodel.checks import ConfigError, GateError, Progress
 from flightmodel.files import file_bytes, write_file
+from postflight.beside import worker_pool
 from postflight.montecarlo.bands import (
     Chunk,
     chunk_from_rows,
@@ -43,8 +38,7 @@ from postflight.montecarlo.bands import (
     remove_partial,
     write_chunk,
 )
-from postflight.montecarlo.study import Stop, Study, read_study, run_trials, sobol_study, whole_trial
-from postflight.streams import THREAD_VARIABLES, keep_arrays, pin_threads
+from postflight.montecarlo.study import Stop, Study, read_study, run_trials, whole_trial
 from synthetic_flight.ensemble import fly_runs
 
 Job = tuple[int, Sequence[int]]
@@ -55,7 +49,6 @@ CONNECT_S = 20
 
 def fly_chunk(study: Study, job: Job) -> Done:
     """Fly the runs of one job; a flight that fails is a row with its reason."""
-    keep_arrays()  # here, as a cluster's worker begins with settings of its own
     number, runs = job
     if study.spec.mode == "whole":
         rows = run_trials(partial(whole_trial, study.plan, study.spec.seed), study.plan, runs)
@@ -75,64 +68,23 @@ def fly_jobs(study: Study, jobs: list[Job], workers: int, scheduler: str | None)
         yield from _in_processes(study, jobs, min(workers, len(jobs)))
 
 
-def _begin() -> None:
-    """Prepare a worker process: its parent handles Ctrl-C, and it ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    sentinel = parent.sentinel
-
-    def follow() -> None:
-        wait_for([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Limit linear algebra of processes that start now to one thread: there are as many of them as cores."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    pin_threads()
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
 def _in_processes(study: Study, jobs: list[Job], workers: int) -> Iterator[Done]:
     ahead = iter(jobs)
-    # spawned, not forked: a fork copies locks that threads of this process may hold
-    context = multiprocessing.get_context("spawn")
     # the study goes with every job: given at the start, it would fill the pipe and let workers start one by one
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
-    begun = multiprocessing.active_children()
     try:
-        with _one_thread_each():
+        with worker_pool(workers) as pool:
             waiting: set[Future[Done]] = {pool.submit(fly_chunk, study, job) for job in islice(ahead, AHEAD * workers)}
-        while waiting:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-                waiting |= {pool.submit(fly_chunk, study, job) for job in islice(ahead, 1)}
+            while waiting:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield future.result()
+                    waiting |= {pool.submit(fly_chunk, study, job) for job in islice(ahead, 1)}
     except BrokenProcessPool:
         raise GateError(
             "a worker process was killed (out of memory?); every finished chunk is kept: the same command resumes from "
             "there, with fewer --workers if memory is short",
             code="worker-killed",
         ) from None
-    finally:
-        for process in multiprocessing.active_children():
-            if process not in begun:
-                process.terminate()
-        # a pipe full of jobs that nobody reads any more would hold the pool's thread for ever (CPython's issue 94777)
-        pool._call_queue._reader.close()  # type: ignore[attr-defined]
-        # waits for the pool's own thread too: one that still ends while Python does closes a pipe that Python writes to
-        pool.shutdown(cancel_futures=True)
 
 
 def is_open(address: str) -> bool:
@@ -197,13 +149,13 @@ def begin(study: Study, folder: Path, flights: int) -> None:
             message = (
                 f"{folder}: flown by version {held['version']}, this is {version('postflight')}; name a new folder"
             )
-            raise ConfigError(message, code="study-version")
+            raise ConfigError(message, code="file-exists")
         if flights < held["flights"]:
             message = f"{folder}: holds a study of {held['flights']} flights; at least as many are wanted"
-            raise ConfigError(message, code="study-larger")
+            raise ConfigError(message, code="file-exists")
     elif folder.exists() and any(folder.iterdir()):
         message = f"{folder}: is not empty and holds no study.json; name a new folder"
-        raise ConfigError(message, code="folder-not-empty")
+        raise ConfigError(message, code="file-exists")
     (folder / "chunks").mkdir(parents=True, exist_ok=True)
     remove_partial(folder)
     _note(folder, settings, flights, study.named)
@@ -224,7 +176,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
             raise ValueError("not a study")
     except FileNotFoundError:
         message = f"{folder}: no study.json; begin with `postflight montecarlo run`"
-        raise GateError(message, code="study-missing") from None
+        raise GateError(message, code="file-missing") from None
     except (ValueError, KeyError, TypeError) as fault:
         raise GateError(f"{path}: damaged: {fault}", code="study-damaged") from None
     found: dict[str, Any] = held
@@ -241,8 +193,6 @@ def study_of(folder: Path) -> tuple[Study, int]:
     """
     held = read_settings(folder)
     study = read_study(held["source"])
-    if "sobol.base" in held["settings"]:
-        study = sobol_study(study, held["settings"]["sobol.by"], held["settings"]["sobol.base"])
     _check_same(folder, held["settings"], json.loads(json.dumps(study.settings())))
     return study, held["flights"]
 
@@ -257,7 +207,7 @@ def _check_same(folder: Path, held: dict[str, Any], asked: dict[str, Any]) -> No
     ]
     more = [f"{folder}: {len(differ)} settings differ in all"] * (len(differ) > MOST_DIFFERENCES)
     remedy = f"{folder}: name a new folder, or restore the settings"
-    raise ConfigError([*lines, *more, remedy], code="study-differs")
+    raise ConfigError([*lines, *more, remedy], code="file-exists")
 
 
 class _Enough:

@@ -1,18 +1,7 @@
-"""What is a Monte Carlo study, which draws does each run have, and which dispersion contributes most to an output?
+"""What is a Monte Carlo study, and which draws does each run have?
 
 A study is a dispersions file with its scenario. Two studies are the same where their settings are: everything but the
-number of flights and the stop rule. Runs draw at random, or by Saltelli's design for Sobol indices: two independent
-samples A and B of ``n`` points of the unit cube from one Sobol' sequence, and for every column the sample A with that
-column from B, ``n (columns + 2)`` flights. A column is a factor, or a section of the dispersions file with all its
-factors; the day-of-flight atmosphere, a whole profile, is drawn from the digits of one coordinate and so is one factor.
-
-``S_i = V(E(y | x_i)) / V(y)`` is the share of the variance by column i alone (first order), ``S_Ti`` its share with all
-interactions (total). `scipy.stats.sobol_indices` gives the same numbers but needs every flight to succeed.
-
-References
-----------
-Saltelli et al., "Variance based sensitivity analysis of model output", Comput. Phys. Commun. 181, 2010, Table 2 (b)
-and (f).
+number of flights and the stop rule.
 
 Are reconstruction and estimators as accurate as they state? Whole trials against the truth of a synthetic flight.
 
@@ -29,16 +18,14 @@ import hashlib
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pandas as pd
 from pydantic import Field
 
 from flightmodel.airdata import air_data
-from flightmodel.checks import NO_FAULT, ConfigError, Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import NO_FAULT, ConfigError, Issue, nearest_name
 from flightmodel.config import Section, parse_section, read_toml
 from flightmodel.events import find_peak
 from flightmodel.flightfolder import read_flight
@@ -47,7 +34,7 @@ from flightmodel.vehicle import DATA, Vehicle
 from postflight.deflections import estimate
 from postflight.flight import Flight
 from postflight.reconstruction import reconstruct
-from synthetic_flight.dispersions import SMALLEST, Dispersions, Window, dispersed_case, draws, run_seed
+from synthetic_flight.dispersions import Dispersions, Window, dispersed_case, draws, run_seed
 from synthetic_flight.dynamics import check_resolved
 from synthetic_flight.ensemble import QUANTITIES, SCALARS, Plan, Row, check_outputs, failure_reason, legs
 from synthetic_flight.folder import simulate_to_folder
@@ -108,14 +95,11 @@ class Study:
     plan : Plan
         With the outputs that the mode gives.
     source : Path
-    design : Design or None
-        Saltelli's, where draws are not random.
     """
 
     spec: DispersionsFile
     plan: Plan
     source: Path
-    design: Design | None = None
 
     @property
     def named(self) -> str:
@@ -125,8 +109,6 @@ class Study:
 
     def draws_of(self, run: int) -> dict[str, float]:
         """Return the number between 0 and 1 of every factor in one run."""
-        if self.design is not None:
-            return self.design.draws_of(run)
         return draws(self.plan.dispersions, self.spec.seed, run)
 
     def runs_of(self, chunk: int, flights: int) -> range:
@@ -143,8 +125,7 @@ class Study:
         scenario = self.plan.scenario
         out = _flat("", self.spec.model_dump(mode="json", exclude={"flights", "stop", "scenario"}))
         out |= _flat("scenario.", scenario.spec.model_dump(mode="json"))
-        out |= _flat("vehicle.", _vehicle_facts(scenario.vehicle))
-        return out | ({} if self.design is None else _flat("sobol.", self.design.settings()))
+        return out | _flat("vehicle.", _vehicle_facts(scenario.vehicle))
 
 
 def _vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
@@ -155,15 +136,6 @@ def _vehicle_facts(vehicle: Vehicle) -> dict[str, Any]:
     parts = ("reference", "joint", "aeroshell", "centerbody", "uncertainty", "geometry", "aero_terms")
     facts = {name: getattr(vehicle, name).model_dump(mode="json") for name in parts}
     return facts | {"coefficients_sha256": hashlib.sha256(table).hexdigest()}
-
-
-def sobol_study(study: Study, by: str, base: int) -> Study:
-    """Return a study that flies Saltelli's design instead of random draws, one column a factor or a section."""
-    if study.spec.mode == "whole":
-        message = f"{study.source}: mode = 'whole': Sobol indices are of mode = 'simulation' alone"
-        raise ConfigError(message, code="sobol-mode")
-    design = design_for(tuple(study.spec.factors()), by, base, study.spec.seed)
-    return replace(study, plan=replace(study.plan, histories=()), design=design)
 
 
 def _flat(prefix: str, value: Any) -> dict[str, Any]:
@@ -187,7 +159,7 @@ def dispersions_path(name: str) -> Path:
     shipped = shipped_dispersions()
     if name not in shipped:
         hint = f"{nearest_name(name, shipped)}; shipped: {', '.join(shipped)}; a path ends in .toml"
-        raise ConfigError(f"no dispersions file '{name}'{hint}", code="dispersions-unknown")
+        raise ConfigError(f"no dispersions file '{name}'{hint}", code="name-unknown")
     return DATA / "dispersions" / f"{name}.toml"
 
 
@@ -209,7 +181,7 @@ def read_study(name: str) -> Study:
     spec = parse_section(DispersionsFile, read_toml(path), str(path))
     own = path.parent / spec.scenario
     scenario = read_scenario(str(own) if spec.scenario.endswith(".toml") else spec.scenario)
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     known = TRIAL_SCALARS if spec.mode == "whole" else SCALARS
     histories = () if spec.mode == "whole" else tuple(QUANTITIES)
     for key, names, allowed in (
@@ -220,151 +192,21 @@ def read_study(name: str) -> Study:
         try:
             check_outputs(names, allowed)
         except ConfigError as fault:
-            faults += [Fault(f"{path}: key '{key}': {words}", words.code) for words in fault.faults]
+            faults += [Issue(f"{path}: key '{key}': {words}", words.code) for words in fault.faults]
     if spec.mode == "whole":
-        faults += [Fault(f"{path}: {words}", words.code) for words in impossible_dispersions(spec)]
+        faults += [Issue(f"{path}: {words}", words.code) for words in impossible_dispersions(spec)]
     try:
         legs(scenario.spec.time, spec.window, spec.joint_is == "locked")
         if spec.window.step_s is not None and spec.joint_is == "flexible":
             check_resolved(scenario.vehicle, spec.window.step_s)
     except ConfigError as fault:
-        faults += [Fault(f"{path}: {words}", words.code) for words in fault.faults]
+        faults += [Issue(f"{path}: {words}", words.code) for words in fault.faults]
     if faults:
         raise ConfigError(faults)
     return Study(spec, Plan(scenario, spec, spec.window, spec.outputs.scalars, spec.outputs.histories), path)
 
 
-LARGEST_BASE = 2**16
-
-
-@dataclass(frozen=True)
-class Design:
-    """Saltelli's design as runs: A, then B, then A with each column from B.
-
-    Parameters
-    ----------
-    factors : tuple of str
-    columns : tuple of str
-        Name of the column of every factor: its own, or its section's.
-    base : int
-        Points of A and of B, a power of two.
-    seed : int
-        Scrambles the sequence.
-    """
-
-    factors: tuple[str, ...]
-    columns: tuple[str, ...]
-    base: int
-    seed: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Columns, each once."""
-        return tuple(dict.fromkeys(self.columns))
-
-    @property
-    def flights(self) -> int:
-        """Runs of the whole design."""
-        return self.base * (len(self.names) + 2)
-
-    def settings(self) -> dict[str, Any]:
-        """Settings that determine the numbers."""
-        return {"base": self.base, "by": "factor" if self.columns == self.factors else "section"}
-
-    @cached_property
-    def _points(self) -> FloatArray:
-        from scipy.stats import qmc  # half a second to import
-
-        sequence = qmc.Sobol(2 * len(self.factors), scramble=True, rng=np.random.default_rng(self.seed))
-        points: FloatArray = sequence.random(self.base)
-        return np.clip(points, SMALLEST, 1.0 - 2.0**-53)
-
-    def draws_of(self, run: int) -> dict[str, float]:
-        """Return the number between 0 and 1 of every factor in one run."""
-        block, row = divmod(run, self.base)
-        a, b = np.split(self._points[row], 2)
-        if block == 0:
-            u = a
-        elif block == 1:
-            u = b
-        else:
-            u = np.where(np.array(self.columns) == self.names[block - 2], b, a)
-        return dict(zip(self.factors, u.tolist(), strict=True))
-
-
-def design_for(factors: tuple[str, ...], by: str, base: int, seed: int) -> Design:
-    """Make a design over factors, one column a factor or a section.
-
-    Raises
-    ------
-    ConfigError
-        Where the base is no power of two, or fewer than two columns are dispersed.
-    """
-    if base < 8 or base > LARGEST_BASE or base & (base - 1):
-        raise ConfigError(f"--base {base}: a power of two from 8 to {LARGEST_BASE} is wanted", code="sobol-base")
-    columns = tuple(f.split(".")[0] if by == "section" else f for f in factors)
-    if len(set(columns)) < 2:
-        message = f"Sobol indices: at least two dispersed {by}s are wanted; got {', '.join(columns) or 'none'}"
-        raise ConfigError(message, code="sobol-columns")
-    return Design(factors, columns, base, seed)
-
-
-RESAMPLES = 999
-
-
-def indices(design: Design, values: FloatArray) -> tuple[pd.DataFrame, int]:
-    """First-order and total indices with 95 % bootstrap intervals.
-
-    Parameters
-    ----------
-    values : (flights,) float
-        Output of every run, NaN where it failed. A point of the design of which one run failed is left out.
-
-    Returns
-    -------
-    table : columns factor, first, first_low_95, first_high_95, total, total_low_95, total_high_95
-    left_out : int
-        Points left out of ``base``.
-
-    Raises
-    ------
-    GateError
-        Where fewer than eight points are left, or the output does not vary.
-    """
-    runs = values.reshape(len(design.names) + 2, design.base)
-    whole = np.isfinite(runs).all(axis=0)
-    kept = runs[:, whole]
-    if kept.shape[1] < 8 or not np.ptp(kept) > 0.0:
-        raise GateError(
-            f"Sobol indices: {kept.shape[1]} whole points of {design.base} with a spread of "
-            f"{np.ptp(kept) if kept.size else 0.0:g}; more flights, or an output that varies, are wanted",
-            code="sobol-spread",
-        )
-
-    from scipy.stats import bootstrap  # half a second to import
-
-    found = bootstrap(
-        (np.arange(kept.shape[1]),), lambda rows: _estimate(kept[:, rows]), vectorized=False,
-        n_resamples=RESAMPLES, method="percentile", confidence_level=0.95, rng=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
-    table = pd.DataFrame({"factor": design.names})
-    for name, value, low, high in zip(("first", "total"), _estimate(kept), found.low, found.high, strict=True):
-        table[name], table[f"{name}_low_95"], table[f"{name}_high_95"] = value, low, high
-    return table, int(design.base - kept.shape[1])
-
-
-def _estimate(runs: FloatArray) -> FloatArray:
-    """First-order and total indices ``(2, columns)`` of runs A, B and A with columns of B, ``(columns + 2, n)``."""
-    runs = runs - runs[:2].mean()
-    a, b, mixed = runs[0], runs[1], runs[2:]
-    variance = runs[:2].var()
-    if not variance > 0.0:
-        return np.zeros((2, len(mixed)))
-    first, total = np.mean(b * (mixed - a), axis=1), 0.5 * np.mean((a - mixed) ** 2, axis=1)
-    return np.stack([first, total]) / variance
-
-
-def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
+def impossible_dispersions(dispersions: Dispersions) -> list[Issue]:
     """Return the keys of a dispersions file that whole trials cannot have."""
     air, found = dispersions.atmosphere, []
     for key in ("density", "wind_north_mps", "wind_east_mps"):
@@ -374,7 +216,7 @@ def impossible_dispersions(dispersions: Dispersions) -> list[Fault]:
         found.append("key 'atmosphere.day' = False: whole trials have a day each; leave it out")
     if dispersions.joint_is == "locked":
         found.append("key 'joint_is' = 'locked': whole trials fly the joint; leave it out")
-    return [Fault(words, "whole-mode-dispersion") for words in found]
+    return [Issue(words, "whole-mode-dispersion") for words in found]
 
 
 def run_trials(trial: Callable[[int], Mapping[str, float]], plan: Plan, runs: Sequence[int]) -> list[Row]:

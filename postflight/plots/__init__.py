@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         figure_bands,
         figure_joints,
         figure_preflight,
-        figure_sobol,
         figure_table_3_1,
     )
     from postflight.plots.style import COLOUR, ZONE, in_style, save, stamp
@@ -40,7 +39,7 @@ _DOOR = {
         "figure_sensitivity",
     ),
     "reconciliation": ("figure_modes", "figure_posterior", "figure_reconciled"),
-    "studies": ("figure_bands", "figure_joints", "figure_preflight", "figure_sobol", "figure_table_3_1"),
+    "studies": ("figure_bands", "figure_joints", "figure_preflight", "figure_table_3_1"),
     "overlay": ("write_overlay_film",),
     "run_figures": ("draw_camera", "draw_run"),
     "style": ("COLOUR", "ZONE", "in_style", "save", "stamp"),
@@ -51,7 +50,7 @@ __all__ = [
     "COLOUR", "ZONE", "draw_camera", "draw_run", "figure_1_3", "figure_2_3", "figure_2_5", "figure_2_7", "figure_2_9",
     "figure_air", "figure_attitude", "figure_bands", "figure_correlation", "figure_filter_and_smoother", "figure_flown",
     "figure_fusion", "figure_increments", "figure_joints", "figure_modes", "figure_posterior", "figure_preflight",
-    "figure_reconciled", "figure_residuals", "figure_sensitivity", "figure_sobol", "figure_summary", "figure_table_3_1",
+    "figure_reconciled", "figure_residuals", "figure_sensitivity", "figure_summary", "figure_table_3_1",
     "in_style", "save", "stamp", "write_overlay_film",
 ]  # fmt: skip
 

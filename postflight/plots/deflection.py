@@ -25,12 +25,10 @@ from postflight.plots.style import (
     band,
     in_style,
     legend_above,
-    stamp,
+    titled,
     with_holes,
 )
 from postflight.reconstruction import Reconstruction
-
-_MANY_ANSWERS = 400  # of a history, above which its single answers are not marked
 
 
 @in_style
@@ -75,9 +73,7 @@ def figure_summary(
     pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
     pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
-    figure.suptitle("Deflection of the aeroshell by each method")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "Deflection of the aeroshell by each method", flight.flight)
 
 
 def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -90,7 +86,7 @@ def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray
         ax.plot(frames.time_s, np.rad2deg(frames.theta_rad), ".", color=COLOUR["camera"], ms=3, label="_frames")
     for method, history in answers.continuous.items():
         t, (theta, sd) = with_holes(history.time_s, [np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)])
-        mark = "" if len(history.time_s) > _MANY_ANSWERS else "."
+        mark = "" if len(history.time_s) > 400 else "."  # of many answers none is marked
         style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
         ax.plot(t, theta, label=LABEL[method], **style)
         band(ax, t, theta, sd, COLOUR[method], alpha=WIDE_BAND)
@@ -129,7 +125,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
     inputs.set_yticks(range(len(names)), names, fontsize=min(8.0, 160.0 / len(names)))
     inputs.set(xlabel="estimate and 1 sd, in a priori standard deviations (grey: a priori)")
-    figure.suptitle(fill(words, 130), fontsize=10)
+    figure.suptitle(fill(words, 130))
     return figure
 
 
@@ -137,23 +133,13 @@ def _southwell(ax: Axes, limbs: Limbs) -> None:
     both = limbs.both
     clear = both.theta_rad > 2.0 * both.theta_sd_rad
     q, theta, sd = both.pressure_pa[clear], both.theta_rad[clear], both.theta_sd_rad[clear]
-    error = np.rad2deg(sd) / np.rad2deg(theta) ** 2
-    ax.errorbar(
-        1e3 / q,
-        1.0 / np.rad2deg(theta),
-        yerr=error,
-        fmt="o",
-        color=COLOUR["measured"],
-        label=f"means of {SPAN_S:g} s, 1 sd",
-    )
+    error, label = np.rad2deg(sd) / np.rad2deg(theta) ** 2, f"means of {SPAN_S:g} s, 1 sd"
+    ax.errorbar(1e3 / q, 1.0 / np.rad2deg(theta), yerr=error, fmt="o", color=COLOUR["measured"], label=label)
     over = np.linspace(1e3 / both.critical_pressure_pa, 1e3 / q.min() if len(q) else 5.0, 200)[1:]
-    for name, limb, colour in (
-        ("both", both, COLOUR["measured"]),
-        ("rise", limbs.rise, COLOUR["estimate"]),
-        ("fall", limbs.fall, COLOUR["second"]),
-    ):
+    shown = (("both", both, "measured"), ("rise", limbs.rise, "estimate"), ("fall", limbs.fall, "second"))
+    for name, limb, colour in shown:
         if limb is not None:
-            ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=colour, label=name, lw=1.0)
+            ax.plot(over, 1.0 / np.rad2deg(limb.deflection(1e3 / over)), color=COLOUR[colour], label=name, lw=1.0)
     low, high = both.critical_interval_pa
     ax.set(xlabel="1 / dynamic pressure (1/kPa)", ylabel="1 / deflection (1/deg)", xlim=(0.0, None), ylim=(0.0, None))
     words = f"{both.critical_pressure_pa:.0f} Pa (90 %: {low:.0f} to {high:.0f})"
@@ -192,13 +178,12 @@ def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
 
 # aerodynamic increments along Mach number
 
-_PANELS = (
-    ("C_A: increment (%)", 100.0),
-    ("C_N: increment (%)", 100.0),
-    ("C_m: increment (%)", 100.0),
-    ("C_mq: increment", 1.0),
-)
-_SHOWN_SD = 2.5  # a priori ones that a panel shows at least
+_PANELS = {
+    "C_A: increment (%)": 100.0,
+    "C_N: increment (%)": 100.0,
+    "C_m: increment (%)": 100.0,
+    "C_mq: increment": 1.0,
+}
 
 
 @in_style
@@ -206,7 +191,7 @@ def figure_increments(increments: AeroIncrements) -> Figure:
     """Increments of the four coefficients along Mach number, before the flight and after it, with 1 sd."""
     figure = Figure(figsize=(9.6, 6.6))
     axes = figure.subplots(2, 2, sharex=True)
-    for k, (ax, (label, scale)) in enumerate(zip(axes.flat, _PANELS, strict=True)):
+    for k, (ax, (label, scale)) in enumerate(zip(axes.flat, _PANELS.items(), strict=True)):
         _along_mach(ax, increments, k, scale)
         ax.set_ylabel(label)
     for ax in axes[1]:
@@ -229,5 +214,6 @@ def _along_mach(ax: Axes, increments: AeroIncrements, k: int, scale: float) -> N
     band(ax, mach, shown, sd, COLOUR["estimate"], label="1 sd")
     if not seen.any():
         ax.text(0.5, 0.9, "not determined by this flight", ha="center", transform=ax.transAxes)
-    top = max(_SHOWN_SD * prior_sd, 1.1 * float(np.max(np.abs(mean) + sd)))
+    # a panel shows 2.5 a priori sd at least
+    top = max(2.5 * prior_sd, 1.1 * float(np.max(np.abs(mean) + sd)))
     ax.set_ylim(-top, top)

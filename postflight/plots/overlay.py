@@ -24,15 +24,13 @@ from flightmodel.film import Image, film_frames
 from flightmodel.telemetry import Telemetry
 from postflight.filming import orient_on_film, with_largest
 
-_RESOLVED_RAD = 1e-4  # less than a fit resolves: the benchmark frame where it was taken as undeflected
-_BETWEEN_PX = 12  # of white between two frames side by side
-
 
 def deflection_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]:
     """Angle and plane, rad, in the frame of that time; zero where it has no answer or less than a fit resolves."""
     k = int(np.argmin(np.abs(history.time_s - time_s)))
     theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
-    return (theta, plane) if abs(theta) > _RESOLVED_RAD and abs(history.time_s[k] - time_s) < 1e-3 else (0.0, 0.0)
+    # less than a fit resolves: the benchmark frame where it was taken as undeflected
+    return (theta, plane) if abs(theta) > 1e-4 and abs(history.time_s[k] - time_s) < 1e-3 else (0.0, 0.0)
 
 
 def oriented_camera(telemetry: Telemetry, history: DeflectionHistory) -> tuple[OrientedCamera, int]:
@@ -59,13 +57,13 @@ def benchmark_and_largest(telemetry: Telemetry, history: DeflectionHistory) -> t
     draw_row(first, rows[0], YELLOW)
     draw_row(second, rows[0], GREY)
     draw_row(second, rows[1], YELLOW)
-    between = np.full((len(first), _BETWEEN_PX, 3), 255, dtype=np.uint8)
+    white = np.full((len(first), 12, 3), 255, dtype=np.uint8)
     caption = (
         f"left: {video.time_s[benchmark]:.2f} s, benchmark; right: {video.time_s[largest]:.2f} s, "
         f"{np.rad2deg(shown[1][1]):.1f} deg; the virtual camera over the right half of each, its edge in yellow, "
         "the benchmark's in grey"
     )
-    return np.concatenate([first, between, second], axis=1), caption
+    return np.concatenate([first, white, second], axis=1), caption
 
 
 def write_overlay(
@@ -103,7 +101,7 @@ def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: P
     with _without_standard_error():  # OpenCV warns there that it takes another tag for VP9, which is no fault
         writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"VP90"), round(rate, 3), size)
     if not writer.isOpened():
-        raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "film-codec-missing")
+        raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "package-missing")
     try:
         for k, image in enumerate(frames.pictures()):
             progress(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")

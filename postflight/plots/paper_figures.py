@@ -26,11 +26,10 @@ from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
-from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, stamp
+from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, titled
 from postflight.reconstruction import Reconstruction
 from postflight.studies.preflight import Bounds, entry_bounds
 
-_STIFF_SHOWN = 20.0  # a joint so many times as stiff as wanted is shown; a locked one lies beyond the axis
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
@@ -73,10 +72,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
     air, pulse = flight.air, flight.required_loads()
-    for ax, bound, nominal in (
-        (upper, bounds.alpha_total_deg, bounds.nominal_alpha_deg),
-        (lower, bounds.normal_g, bounds.nominal_normal_g),
-    ):
+    for ax, (bound, nominal) in zip((upper, lower), bounds.by_quantity.values(), strict=True):
         share = f"2.3 to 97.7 % of {bounds.flights} rigid flights"
         ax.fill_between(bounds.time_s, bound[0], bound[2], color=COLOUR["prior_band"], lw=0, label=share)
         ax.plot(bounds.time_s, bound[1], color=COLOUR["prior"], lw=1, label="rigid, 50 %")
@@ -91,9 +87,7 @@ def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: in
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel=TIME)
     legend_above(upper, 3)
     legend_above(lower, 4)
-    figure.suptitle("Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)", flight.flight)
 
 
 @in_style
@@ -188,9 +182,7 @@ def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number
     ax.set(xlim=window(flight), ylabel="total angle of attack (deg)", xlabel=TIME)
     fit_height(ax, flight, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)
-    figure.suptitle(f"{title} (AIAA 2011-2571, Figure {number})")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, f"{title} (AIAA 2011-2571, Figure {number})", flight.flight)
 
 
 @in_style
@@ -199,7 +191,8 @@ def figure_2_9(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: flo
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
     marks = (static.critical_stiffness_nmprad, joint_nmprad, static.stiffness_for_growth(0.25))
-    ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, _STIFF_SHOWN * marks[2]))
+    # a joint 20 times as stiff as wanted is shown; a locked one lies beyond the axis
+    ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, 20.0 * marks[2]))
     stiffness = np.geomspace(*ends, 600)
     for offset, colour in zip(offsets_m, MANY[1:], strict=False):
         angle = np.rad2deg(static.trim_angle(stiffness, offset))

@@ -11,13 +11,12 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.telemetry import Telemetry
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, titled
 from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
 
 _FOUND = COLOUR["estimate"]
-_HIGHEST_HZ = 5.0
 
 
 @in_style
@@ -41,9 +40,7 @@ def figure_reconciled(
     _ridge(axes[2, 1], found)
     for ax in axes.ravel()[:5]:
         ax.set_xlabel(TIME)
-    figure.suptitle("Joint reconciled with the flight")
-    stamp(figure, telemetry)
-    return figure
+    return titled(figure, "Joint reconciled with the flight", telemetry)
 
 
 def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, label: str) -> None:
@@ -58,8 +55,7 @@ def _residuals(ax: Axes, t: FloatArray, residual: FloatArray, label: str) -> Non
         ax.plot(t, residual[..., axis].ravel(), color=colour, lw=0, marker=".", ms=1.5, label=name)
     limits(ax)
     far = max(5.0, 1.05 * float(np.nanmax(np.abs(residual), initial=0.0)))
-    ax.set_ylim(-far, far)
-    ax.set_ylabel(label)
+    ax.set(ylabel=label, ylim=(-far, far))
     ax.legend(ncols=3, markerscale=4)
 
 
@@ -70,8 +66,7 @@ def _deflection(ax: Axes, history: DeflectionHistory, fused: DeflectionHistory |
     theta, sd = np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)
     ax.plot(history.time_s, theta, color=_FOUND, label="with the estimated joint")
     band(ax, history.time_s, theta, sd, _FOUND, label="1 sd")
-    ax.set_ylabel("deflection (deg)")
-    ax.set_ylim(bottom=0.0)
+    ax.set(ylabel="deflection (deg)", ylim=(0.0, None))
     legend_above(ax, 3)
 
 
@@ -80,10 +75,8 @@ def _ridge(ax: Axes, found: JointFit) -> None:
     mean, covariance = stiffness_and_offset(found)
     ellipses(ax, mean, covariance)
     ax.plot(*mean, color=_FOUND, marker="+", ms=10, lw=0)
-    ax.set_xlabel("bending stiffness (N m/rad)")
-    ax.set_ylabel("c.g. offset (cm)")
     share = covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1])
-    ax.set_title(f"correlation {share:+.2f}")
+    ax.set(xlabel="bending stiffness (N m/rad)", ylabel="c.g. offset (cm)", title=f"correlation {share:+.2f}")
     ax.legend(loc="best")
 
 
@@ -96,26 +89,22 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
     figure = Figure(figsize=(2.0 * n, 2.0 * n))
     axes = figure.subplots(n, n, squeeze=False)
     values = table.to_numpy()
-    for row in range(n):
-        for column in range(n):
-            ax = axes[row, column]
-            if column > row:
-                ax.axis("off")
-            elif column == row:
-                _histogram(ax, values[:, row], best[row], float(np.sqrt(covariance[row, row])))
-            else:
-                pair = [column, row]
-                ax.plot(*values[:, pair].T, ".", color=COLOUR["prior"], ms=1.0, alpha=0.4, rasterized=True)
-                ellipses(ax, best[pair], covariance[np.ix_(pair, pair)] + 1e-12 * np.diag(np.diag(covariance)[pair]))
-            ax.xaxis.set_major_locator(MaxNLocator(3))
-            ax.tick_params(labelsize=7, labelleft=column == 0 and row > 0, labelbottom=row == n - 1)
-            if row == n - 1:
-                ax.set_xlabel(table.columns[column], fontsize=8)
-            if column == 0 and row > 0:
-                ax.set_ylabel(table.columns[row], fontsize=8)
-    figure.suptitle("Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)")
-    stamp(figure, telemetry)
-    return figure
+    for (row, column), ax in np.ndenumerate(axes):
+        if column > row:
+            ax.axis("off")
+        elif column == row:
+            _histogram(ax, values[:, row], float(best[row]), float(np.sqrt(covariance[row, row])))
+        else:
+            pair = [column, row]
+            ax.plot(*values[:, pair].T, ".", color=COLOUR["prior"], ms=1.0, alpha=0.4, rasterized=True)
+            ellipses(ax, best[pair], covariance[np.ix_(pair, pair)] + 1e-12 * np.diag(np.diag(covariance)[pair]))
+        ax.xaxis.set_major_locator(MaxNLocator(3))
+        ax.tick_params(labelsize=7, labelleft=column == 0 and row > 0, labelbottom=row == n - 1)
+        if row == n - 1:
+            ax.set_xlabel(table.columns[column], fontsize=8)
+        if column == 0 and row > 0:
+            ax.set_ylabel(table.columns[row], fontsize=8)
+    return titled(figure, "Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)", telemetry)
 
 
 def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
@@ -131,7 +120,7 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     figure = Figure(figsize=(9.0, 4.8))
     left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
     left.grid(visible=False)
-    shown = np.abs(found.frequency_hz) < _HIGHEST_HZ
+    shown = np.abs(found.frequency_hz) < 5.0
     picture = left.pcolormesh(
         found.time_s, found.frequency_hz[shown], found.power.T[shown], shading="nearest", cmap="Greys", vmin=0.0
     )
@@ -148,6 +137,4 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     right.axvspan(low, high, color=_FOUND, alpha=BAND, lw=0, label="1 sd")
     right.set(xlabel="bending stiffness (N m/rad)", ylabel="power along the joint's track")
     right.legend()
-    figure.suptitle("Modes of the lateral motion and the linear model")
-    stamp(figure, telemetry)
-    return figure
+    return titled(figure, "Modes of the lateral motion and the linear model", telemetry)

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Parameters = ParamSpec("Parameters")
-_PAPER_OFFSETS_M = (0.01, 0.0254)  # of the c.g., beside the vehicle's own, as in the paper's Figure 2.9
 
 
 def draw_run(
@@ -86,9 +85,9 @@ def draw_deflections(flight: Reconstruction, folder: Path, answers: Deflections)
     if answers.fused is not None:
         answer = answers.fused
         words = f"{answer.agreement.remark}; {answer.limbs_remark}"
-        draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer.fused, answer.limbs, words)
+        draw(folder / "fusion.png", _stamped(figure_fusion, flight.flight), answer, answer.limbs, words)
         correlation = _stamped(figure_correlation, flight.flight)
-        draw(folder / "correlation.png", correlation, answer.fused, answer.agreement.singular_values)
+        draw(folder / "correlation.png", correlation, answer, answer.agreement.singular_values)
     if answers.histories:
         draw(folder / "summary.png", figure_summary, flight, answers)
 
@@ -129,7 +128,7 @@ def _draw_static_trim(pulse: FlightLoads, flight: Flight, folder: Path) -> None:
     except GateError:
         return
     own = float(np.linalg.norm(vehicle.cg_m[1:]))
-    offsets = sorted({round(own, 5), *_PAPER_OFFSETS_M})
+    offsets = sorted({round(own, 5), 0.01, 0.0254})  # its own, and those of the paper's figure
     title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
     stiffness = vehicle.joint.bending_stiffness_nmprad
     draw(folder / "figure_2_9.png", _stamped(figure_2_9, flight), static, offsets, stiffness, title)

@@ -1,4 +1,4 @@
-"""How do many flights scatter? Monte Carlo bands, Sobol indices, and the paper's studies of the joint.
+"""How do many flights scatter? Monte Carlo bands, and the paper's studies of the joint.
 
 The paper's (AIAA 2011-2571): Table 3.1 as a figure, Figures 3.1 to 3.3, and Figure 1.3 before and after the joint is
 made flexible.
@@ -11,12 +11,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
-from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, note, percentiles
+from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, percentiles, titled
 from postflight.studies.joints import JointStudy
 from postflight.studies.preflight import Bounds
 from postflight.studies.shell_test import ShellTest
 
-_MOST_BARS = 15
 _HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
 _LABEL = {
     "alpha_total_deg": "centerbody total\nangle of attack (deg)",
@@ -44,35 +43,7 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
         ax.margins(x=0)
     axes[0].legend()
     axes[-1].set_xlabel(TIME)
-    figure.suptitle(title, fontsize=10)
-    note(figure, synthetic)
-    return figure
-
-
-@in_style
-def figure_sobol(table: pd.DataFrame, title: str, synthetic: str) -> Figure:
-    """First-order and total indices with their intervals, the largest total on top."""
-    left_out = max(0, len(table) - _MOST_BARS)
-    table = table.sort_values("total", kind="stable").tail(_MOST_BARS)
-    place = np.arange(len(table))
-    figure = Figure(figsize=(7.2, 0.36 * len(table) + 1.6))
-    ax = figure.subplots()
-    for k, (name, label, colour) in enumerate(
-        (("first", "first order: alone", COLOUR["second"]), ("total", "total: with others", COLOUR["estimate"]))
-    ):
-        at = place + 0.2 * (2 * k - 1)
-        interval = [np.abs(table[f"{name}_{end}_95"] - table[name]) for end in ("low", "high")]
-        ax.barh(at, table[name], 0.36, color=colour, label=label)
-        ax.errorbar(table[name], at, xerr=interval, fmt="none", ecolor=COLOUR["limit"], lw=0.9)
-    ax.set_yticks(place, table["factor"], fontsize=8)
-    ax.axvline(0.0, color=COLOUR["zero"], lw=0.8)
-    more = f"; {left_out} factors with smaller totals are not shown" if left_out else ""
-    ax.set_xlabel(f"share of the variance (bars) and 95 % interval (lines){more}")
-    ax.grid(visible=False, axis="y")
-    ax.legend(loc="lower right")
-    figure.suptitle(title, fontsize=10)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, title, synthetic)
 
 
 @in_style
@@ -96,9 +67,7 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter("")
     left.legend(fontsize=7)
-    figure.suptitle("Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)")
-    note(figure, synthetic)
-    return figure
+    return titled(figure, "Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)", synthetic)
 
 
 @in_style
@@ -121,9 +90,7 @@ def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synt
     ax.set(xlabel=f"{TIME}; dotted: peak dynamic pressure", ylabel=label, ylim=(0.0, min(highest, 1.15 * largest)))
     ax.set_xlim(study.flights[0].time_s[0], study.flights[0].time_s[-1])
     ax.legend(title=f"beyond the axis: {', '.join(beyond)}" if beyond else None)
-    figure.suptitle(title)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, title, synthetic)
 
 
 @in_style
@@ -143,25 +110,21 @@ def figure_preflight(
     """
     figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
-    shown = (flight["time_s"] >= window[0]) & (flight["time_s"] <= window[1])
-    rows = (
-        ("alpha_total_deg", "nominal_alpha_deg", "total angle of attack (deg)"),
-        ("normal_g", "nominal_normal_g", "normal acceleration (g)"),
-    )
+    shown = flight["time_s"].between(*window)
+    rows = {"alpha_total_deg": "total angle of attack (deg)", "normal_g": "normal acceleration (g)"}
     for column, (bounds, name) in enumerate(((rigid, "joint locked"), (flexible, "flexible joint"))):
-        for ax, (quantity, nominal, _) in zip(axes[:, column], rows, strict=True):
-            percentiles(ax, bounds.time_s, *getattr(bounds, quantity))
-            ax.plot(bounds.time_s, getattr(bounds, nominal), color=COLOUR["nominal"], lw=1.0, ls="--", label="nominal")
+        for ax, quantity in zip(axes[:, column], rows, strict=True):
+            bands, nominal = bounds.by_quantity[quantity]
+            percentiles(ax, bounds.time_s, *bands)
+            ax.plot(bounds.time_s, nominal, color=COLOUR["nominal"], lw=1.0, ls="--", label="nominal")
             ax.plot(flight["time_s"], flight[quantity], color=COLOUR["measured"], label="flight, reconstructed")
         axes[0, column].set_title(f"{name}: {bounds.flights} flights")
         axes[1, column].set_xlabel(TIME)
-    for ax, (quantity, _, label) in zip(axes[:, 0], rows, strict=True):
+    for ax, (quantity, label) in zip(axes[:, 0], rows.items(), strict=True):
         ax.set(ylabel=label, ylim=(0.0, 2.2 * float(flight.loc[shown, quantity].max())))
     axes[0, 0].set_xlim(*window)
     axes[0, 0].legend()
-    figure.suptitle(f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", fontsize=10)
-    note(figure, synthetic)
-    return figure
+    return titled(figure, f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", synthetic)
 
 
 @in_style
@@ -174,15 +137,12 @@ def figure_shell_test(found: ShellTest, title: str) -> Figure:
     shown = (("selected", selected, "second"), ("not selected", found.fits[0], "limit"))
     for name, fit, colour in shown if selected is not found.fits[0] else shown[1:]:
         label = f"{name}: {' and '.join(fit.laws) or 'straight spring'}, rms {100.0 * fit.rms_share:.1f} %"
-        ax.plot(
-            np.rad2deg(test.angle_rad - fit.residual_rad), test.moment_nm, color=COLOUR[colour], lw=1.0, label=label
-        )
+        fitted = np.rad2deg(test.angle_rad - fit.residual_rad)
+        ax.plot(fitted, test.moment_nm, color=COLOUR[colour], lw=1.0, label=label)
         left.plot(test.time_s, 100.0 * fit.residual_rad / test.largest_rad, color=COLOUR[colour], lw=1.0)
-    ax.set_xlabel("angle (deg)")
-    ax.set_ylabel("moment in the joint (N m)")
+    ax.set(xlabel="angle (deg)", ylabel="moment in the joint (N m)")
     ax.legend(fontsize=7)
     left.axhline(0.0, color=COLOUR["zero"], lw=0.8)
-    left.set_xlabel("time (s)")
-    left.set_ylabel("measured less fitted (% of the largest)")
-    figure.suptitle(title, fontsize=10)
+    left.set(xlabel="time (s)", ylabel="measured less fitted (% of the largest)")
+    figure.suptitle(title)
     return figure

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from postflight.flight import Flight
+
 _BLACK, _BLUE, _VERMILION, _GREEN = "#000000", "#0072B2", "#D55E00", "#009E73"
 _PURPLE, _ORANGE, _SKY, _YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
 _INK, _DARK, _GREY, _PALE, _WHITE = "#1C2126", "#57616B", "#8A929A", "#DDE2E7", "#FFFFFF"
@@ -81,35 +83,18 @@ PAGE = {
 OVER_FRAME = {"used": _GREEN, "left": _VERMILION, "outline": _YELLOW, "marks": _SKY}
 
 LABEL = {
-    "camera": "video (virtual camera)",
-    "misalignment": "accelerometers (misalignment)",
-    "trim": "trim angle",
+    "camera": "video (virtual camera)", "misalignment": "accelerometers (misalignment)", "trim": "trim angle",
     "fused": "all fused",
-}
+}  # fmt: skip
 STROKE = {"camera": "-", "misalignment": "--", "trim": "-.", "fused": "-"}
 TIME = "time after launch (s)"
 BAND, WIDE_BAND = 0.2, 0.15  # opacities: of one band, and of several that overlap
-_SMALL, _LEGEND, _TITLE, _MAIN = 7, 8, 9, 10
-_DPI = 110
 _PARAMETERS: dict[Any, Any] = {
-    "figure.constrained_layout.use": True,
-    "figure.titlesize": _MAIN,
-    "font.size": 9.5,
-    "axes.titlesize": _TITLE,
-    "axes.labelsize": 9,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.alpha": 0.3,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.labelsize": 8.5,
-    "ytick.labelsize": 8.5,
-    "lines.linewidth": 1.2,
-    "legend.frameon": False,
-    "legend.fontsize": _LEGEND,
-    "legend.title_fontsize": _LEGEND,
-    "legend.loc": "upper left",
-}
+    "figure.constrained_layout.use": True, "figure.titlesize": 10, "font.size": 9.5, "lines.linewidth": 1.2,
+    "axes.titlesize": 9, "axes.labelsize": 9, "axes.grid": True, "axes.axisbelow": True, "grid.alpha": 0.3,
+    "axes.spines.top": False, "axes.spines.right": False, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5,
+    "legend.frameon": False, "legend.fontsize": 8, "legend.title_fontsize": 8, "legend.loc": "upper left",
+}  # fmt: skip
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -207,13 +192,25 @@ def drawn_unit(unit: str) -> tuple[float, str]:
 
 def note(figure: Figure, words: str) -> None:
     """Write in the lower right corner what was flown."""
-    figure.supxlabel(words, x=0.995, ha="right", fontsize=_SMALL, color=COLOUR["note"], parse_math=False)
+    figure.supxlabel(words, x=0.995, ha="right", fontsize=7, color=COLOUR["note"], parse_math=False)
 
 
 def stamp(figure: Figure, telemetry: Telemetry, changes: tuple[str, ...] = ()) -> None:
     """Name the flight in the corner, whether it is synthetic, and what a what-if assumes."""
     assumed = f"; what-if: {'; '.join(changes)}" if changes else ""
     note(figure, f"{telemetry.name}: {'SYNTHETIC flight' if telemetry.synthetic else 'flight'}{assumed}")
+
+
+def titled(figure: Figure, title: str, flown: str | Telemetry | Flight) -> Figure:
+    """Figure with its title, and in its corner the flight (as `stamp`), or the words that say what was flown."""
+    figure.suptitle(title)
+    if isinstance(flown, str):
+        note(figure, flown)
+    elif isinstance(flown, Telemetry):
+        stamp(figure, flown)
+    else:
+        stamp(figure, flown.telemetry, flown.changes)
+    return figure
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -223,7 +220,7 @@ def save(figure: Figure, path: Path) -> None:
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure.set_dpi(_DPI)
+    figure.set_dpi(110)
     canvas, layout = FigureCanvasAgg(figure), figure.get_layout_engine()
     if layout is not None:
         layout.execute(figure)

@@ -10,13 +10,11 @@ from matplotlib.figure import Figure
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
 from flightmodel.trajectory import difference, resample
-from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, stamp
+from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, titled
 from postflight.reconstruction import AttitudeCheck, Reconstruction
 from postflight.sensitivity import GROUPS, largest_of_groups
 from recon.atmosphere import ReconstructedAir
 from recon.measurements import component_unit
-
-_LEAST_LOST = 1e-3  # of the filter's variance that the smoother takes away, for a difference to be drawn
 
 
 @in_style
@@ -29,20 +27,17 @@ def figure_flown(flight: Reconstruction) -> Figure:
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
     fast.set(ylabel="ground speed (m/s)", ylim=(0, None))
-    for part, colour, label in (
-        (slice(0, 3), COLOUR["estimate"], "position (m)"),
-        (slice(3, 6), COLOUR["second"], "velocity (m/s)"),
-    ):
-        sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, part], axis=1), color=colour, label=label)
+    for first, colour, label in ((0, COLOUR["estimate"], "position (m)"), (3, COLOUR["second"], "velocity (m/s)")):
+        sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, first : first + 3], axis=1), color=colour, label=label)
     sure.set(ylabel="standard deviation", xlabel=TIME)
     sure.legend(loc="best")
     found = [f for f in flight.solution.findings if f.source == "motion"]
     for ax in (high, fast, sure):
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
-    figure.suptitle("Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""))
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(
+        figure, "Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""), flight.flight
+    )
 
 
 @in_style
@@ -68,11 +63,8 @@ def figure_residuals(flight: Reconstruction) -> Figure:
         ax.set_ylabel(f"{source}\n{component} ({unit})", fontsize=7)
         ax.set_ylim(-limit, limit)
     axes[-1].set_xlabel(TIME)
-    figure.suptitle(
-        "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside", fontsize=10
-    )
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    title = "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside"
+    return titled(figure, title, flight.flight)
 
 
 def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) -> None:
@@ -97,8 +89,8 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     t, off = smoothed.time_s, difference(filtered, smoothed)
     var_filter, var_smoother = (np.diagonal(p, axis1=1, axis2=2) for p in (filtered.covariance, smoothed.covariance))
     lost = var_filter - var_smoother
-    # towards the end both are the same, and the ratio of nothing to nothing
-    sure = lost > _LEAST_LOST * var_filter
+    # towards the end both are the same, and the ratio of nothing to nothing: a thousandth of the variance must be lost
+    sure = lost > 1e-3 * var_filter
     ratio = np.where(sure, off / np.sqrt(np.where(sure, lost, 1.0)), np.nan)
     for k, ((name, unit, scale), (spread, apart)) in enumerate(zip(groups, grid, strict=True)):
         part = slice(3 * k, 3 * k + 3)
@@ -117,9 +109,8 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     legend_above(grid[0, 0], 2)
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
-    figure.suptitle("Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    title = "Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)"
+    return titled(figure, title, flight.flight)
 
 
 @in_style
@@ -132,20 +123,16 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     height_km = column["altitude_m"] / 1000.0
     wind = profile_from_sounding(flight.telemetry.sounding).at(1000.0 * height_km).wind_ned_mps
     one = np.ones(len(height_km))
-    ratio_sd, prior_ratio_sd, prior_wind_sd = (
-        column[n] for n in ("density_ratio_sd", "density_ratio_prior_sd", "wind_prior_sd_mps")
-    )
-    _along_height(axes[0], height_km, (column["density_ratio"], ratio_sd), (one, prior_ratio_sd))
+    found = column["density_ratio"], column["density_ratio_sd"]
+    _along_height(axes[0], height_km, found, (one, column["density_ratio_prior_sd"]))
     for k, (ax, way) in enumerate(zip(axes[1:], ("north", "east"), strict=True)):
         found = wind[:, k] + column[f"wind_{way}_change_mps"], column[f"wind_{way}_sd_mps"]
-        _along_height(ax, height_km, found, (wind[:, k], prior_wind_sd))
+        _along_height(ax, height_km, found, (wind[:, k], column["wind_prior_sd_mps"]))
         ax.set_xlabel(f"wind velocity, {way} (m/s)")
     axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
     upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     _drag(lower.subplots(), day.drag)
-    figure.suptitle("As-flown atmosphere from the deceleration along the reconstructed trajectory")
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(figure, "As-flown atmosphere from the deceleration along the reconstructed trajectory", flight.flight)
 
 
 def _along_height(
@@ -202,9 +189,9 @@ def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
     figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     axes[-1].set_xlabel(TIME)
     remark = "\n(not independent: the trajectory depends on these sensors too)" if check.dependence else ""
-    figure.suptitle("Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark)
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    return titled(
+        figure, "Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark, flight.flight
+    )
 
 
 @in_style
@@ -235,10 +222,6 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
     grid[0].invert_yaxis()
     for ax in grid[len(groups) :]:
         ax.set_visible(False)
-    figure.suptitle(
-        "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
-        "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3",
-        fontsize=10,
-    )
-    stamp(figure, flight.telemetry, flight.flight.changes)
-    return figure
+    title = "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
+    title += "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3"
+    return titled(figure, title, flight.flight)

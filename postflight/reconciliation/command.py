@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
-from flightmodel.checks import GateError, Progress, check_type
+from flightmodel.checks import Check, GateError, Progress, check_type, part_of
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import name_of, require_earth
 from flightmodel.flightfolder import read_flight
@@ -25,6 +24,7 @@ from flightmodel.statistics import chi_square_quantile
 from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle
 from postflight import run_folder
+from postflight.beside import Beside, same
 from postflight.commands import compile_kernels, console, print_checks
 from postflight.deflections import camera_for_fusion
 from postflight.flight import RECONSTRUCT, Flight
@@ -40,18 +40,16 @@ from postflight.reconciliation.posterior import (
     posterior_sd,
     posterior_summary,
     quantities,
-    require_samplers,
-    sample_selection,
+    require_sampler,
+    sample,
     stiffness_bound,
     vehicle_file_lines,
 )
 from postflight.reconstruction import Reconstruction, reconstruct
-from postflight.second_process import SecondProcess
-from postflight.streams import keep_arrays, on_one_thread
+from postflight.streams import on_one_thread
 from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
-from recon.consistency import ConsistencyCheck, consistency_check
 from synthetic_flight.dispersions import Factor, JointDispersions
 
 STRONG = 3.0  # logarithm of odds of twenty to one
@@ -62,7 +60,6 @@ LAW_NAMES = {
 }
 CONFIDENCE = 0.999  # as the reconstruction's checks
 MOST_OFF_SD = 4.0  # as the camera's time bias
-MOST_BY_STEPS_SD = 0.5  # which widens an interval by an eighth; the fit corrects what is above a tenth
 MOST_MOVED_SD = 4.0  # of some forty parameters of a right fit one is beyond it in two fits of a thousand
 JOINT_WORDS = (
     "another joint, or freeplay (--freeplay) or creep (--creep), than was fitted; mass properties or sensors' places "
@@ -87,7 +84,7 @@ class Reconciliation(Tabular):
     fit: JointFit
 
     @cached_property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether the fit can be believed."""
         return credibility(self.fit, _modes(self.bet, self.fit)[0])
 
@@ -103,10 +100,9 @@ class Reconciliation(Tabular):
     def bounds(self, flights: int = 60, progress: Progress | None = None) -> tuple[Bounds, Bounds]:
         """Bands of dispersed entries with the joint locked, and with the fitted joint."""
         report = progress or (lambda _fraction, _what: None)
-        rigid = entry_bounds(self.bet, None, flights, progress=lambda f, what: report(0.3 * f, what))
+        rigid = entry_bounds(self.bet, None, flights, progress=part_of(report, 0.0, 0.3))
         laws, vehicle = dispersed(self.fit)
-        flexible = lambda f, what: report(0.3 + 0.7 * f, what)  # noqa: E731
-        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=flexible, vehicle=vehicle)
+        return rigid, entry_bounds(self.bet, laws, ENTRIES, progress=part_of(report, 0.3, 1.0), vehicle=vehicle)
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
@@ -153,35 +149,34 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     """Reconstruct, reconcile, write a run folder and print the result."""
     settings = {"reconcile": True, "laws": list(laws), "posterior": sampled}
     if sampled:
-        require_samplers()
-    keep_arrays()
-    with SecondProcess() as second, progress_bar() as report:
-        report(0.0, "reading telemetry")
-        telemetry = read_flight(folder, lambda f: report(0.02 * f, "reading telemetry"))
-        require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
-        require_damping(telemetry.required_vehicle())
-        compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
+        require_sampler()
+    with progress_bar() as report:
+        telemetry = read_flight(folder, lambda f: report(f, "reading telemetry"))
+    require_earth(name_of(telemetry.planet), "the reconciliation's simulator")
+    require_damping(telemetry.required_vehicle())
+    compile_kernels(*RECONSTRUCTION, "simulator", "ensembles", "creep", "spans")
+    with Beside() as beside, progress_bar() as report:
         measured = Flight(telemetry)
-        second.ask(camera_for_fusion, measured)
+        camera = beside.keep(camera_for_fusion, measured)
         flight = reconstruct(measured, progress=lambda f, what: report(0.02 + 0.18 * f, what))
-        second.ask(without_fit, flight, second.answer())
+        kept = beside.keep(same, flight)
+        no_fit = beside.submit(without_fit, kept, camera)
         fitting = 0.4 if sampled else 0.7
         selection = select_laws(flight, laws, lambda f, what: report(0.2 + fitting * f, what))
         fit, odds = selection.fit, selection.log_odds
         posterior = None
         if sampled:
-            posterior, nested = sample_selection(selection, lambda f, what: report(0.6 + 0.3 * f, what))
-            odds |= nested
+            posterior = sample(fit, lambda f, what: report(0.6 + 0.3 * f, what))
         report(0.9, "flying entries with the fitted joint")
         laws_flown, vehicle = dispersed(fit)
-        second.ask(entry_bounds, flight, laws_flown, ENTRIES, 0, None, vehicle)
+        with_fit = beside.submit(entry_bounds, kept, laws_flown, ENTRIES, 0, None, vehicle)
         # a third of a second to import, while the other process flies
         from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
         from postflight.plots.style import draw
         from postflight.studies.commands import bands, compared_with_bounds
 
         modal, no_modes = _modes(flight, fit)
-        fused, rigid = second.answer()
+        fused, rigid = no_fit.result()
         settings["output_rate_hz"] = flight.flight.settings.output_rate_hz
         with run_folder.RunFolder(folder, telemetry, settings) as out:
             table = joint_table(fit)
@@ -204,7 +199,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             if posterior is not None:
                 draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
             draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
-            flexible = second.answer()
+            flexible = with_fit.result()
             shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
             out.write_csv("bands.csv", bands(rigid, flexible))
             out.write_csv("bands_shares.csv", shares)
@@ -228,7 +223,7 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
 def _modal(flight: Reconstruction, fit: JointFit) -> ModalStiffness:
     """Stiffness by the joint's frequency, looked for about the fit's."""
     if stiffness_bound(fit) is not None:
-        raise GateError("modes: the joint is too stiff to be seen oscillating", code="mode-not-detected")
+        raise GateError("modes: the joint is too stiff to be seen oscillating", code="not-observable")
     return stiffness_from_modes(flight, fit.vehicle.joint.bending_stiffness_nmprad)
 
 
@@ -254,20 +249,17 @@ def _posterior_summary(posterior: Posterior | None) -> dict[str, object]:
     return {
         "posterior_refit_error_of_cost": posterior.refit_error.tolist(),
         "posterior_steps_to_forget": posterior.autocorrelation_steps,
-        "posterior_log_evidence_over_laplace": posterior.log_evidence - posterior.fit.log_evidence,
-        "posterior_log_evidence_sd": posterior.log_evidence_sd,
     }
 
 
 def _print_posterior(posterior: Posterior) -> None:
     """Table of the samples beside the linear problem."""
-    printed = Table(title="Posterior (emcee)")
-    for name in ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in posterior_summary(posterior).itertuples(index=False):
         interval = f"{r.low:.4g} to {r.high:.4g}"
-        printed.add_row(r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval)
-    console.print(printed)
+        rows.append((r.quantity, f"{r.best:.4g}", f"{r.linear_sd:.2g}", f"{r.median:.4g}", f"{r.sd:.2g}", interval))
+    names = ("quantity", "most probable", "linear sd", "median", "sd", "90 % interval")
+    console.table("Posterior (emcee)", names, rows)
 
 
 def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
@@ -281,7 +273,7 @@ def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
 
 
 def _summary(
-    fit: JointFit, table: pd.DataFrame, odds: dict[str, float], checks: tuple[ConsistencyCheck, ...]
+    fit: JointFit, table: pd.DataFrame, odds: dict[str, float], checks: tuple[Check, ...]
 ) -> dict[str, object]:
     """Return the fit's quality and the joint, for ``reconciliation.json``."""
     return {
@@ -300,16 +292,14 @@ def _summary(
 
 def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> None:
     """Table of the joint, and the odds of the laws that were asked for."""
-    printed = Table(title="The joint that explains the flight")
-    for name in ("quantity", "vehicle file", "found", "1 sd", "90 % interval"):
-        printed.add_column(name, justify="left" if name == "quantity" else "right")
+    rows = []
     for r in table.itertuples(index=False):
-        name = f"{r.quantity} ({r.unit})" if r.unit else str(r.quantity)
+        found = f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}"
         if r.kind == "lower bound":
-            printed.add_row(name, f"{r.told:.4g}", f"above {r.low:.3g}", "", "95 % lower bound")
-            continue
-        printed.add_row(name, f"{r.told:.4g}", f"{r.found:.4g}", f"{r.sd:.2g}", f"{r.low:.4g} to {r.high:.4g}")
-    console.print(printed)
+            found = f"above {r.low:.3g}", "", "95 % lower bound"
+        rows.append((f"{r.quantity} ({r.unit})" if r.unit else r.quantity, f"{r.told:.4g}", *found))
+    names = ("quantity", "vehicle file", "found", "1 sd", "90 % interval")
+    console.table("The joint that explains the flight", names, rows)
     for law, name in LAW_NAMES.items():
         if law not in odds:
             continue
@@ -323,7 +313,7 @@ def _print_joint(fit: JointFit, table: pd.DataFrame, odds: dict[str, float]) -> 
         )
 
 
-def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[ConsistencyCheck, ...]:
+def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Check, ...]:
     """Checks of residuals, moves, joins and convergence, and against the stiffness by the joint's frequency."""
     checks = (_residuals(fit), _moves(fit), _spans(fit), _convergence(fit), *_steps(fit), *_creep(fit))
     # a loose joint oscillates at the frequency of a softer one
@@ -332,7 +322,7 @@ def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Con
     return (*checks, _frequency(fit, modal))
 
 
-def _residuals(fit: JointFit) -> ConsistencyCheck:
+def _residuals(fit: JointFit) -> Check:
     """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
     problem = fit.problem
     # every parameter but the motion has an a priori residual; of the first motion all but the three rates
@@ -340,20 +330,20 @@ def _residuals(fit: JointFit) -> ConsistencyCheck:
     degrees = int((problem.weight > 0.0).sum()) + fit.residuals.joins.size - problem.motion * problem.measured.spans
     degrees += first
     high = chi_square_quantile(CONFIDENCE, degrees) / degrees
-    return consistency_check(
+    return Check.of(
         "joint-residuals", "reconciliation: residuals", fit.residuals.cost / degrees, 0.0, high,
         "residuals no larger than predicted", "residuals are larger than predicted", advice=JOINT_WORDS,
     )  # fmt: skip
 
 
-def _moves(fit: JointFit) -> ConsistencyCheck:
+def _moves(fit: JointFit) -> Check:
     """Largest move of what is stated of vehicle and instruments, over its a priori sd."""
     names = fit.problem.vehicle_parameters.names
     stated = np.array([name not in OPEN for name in names])
     moved = np.abs(np.concatenate([fit.parameters.vehicle * stated, fit.parameters.instruments]))
     worst = int(np.argmax(moved))
     name = names[worst] if worst < len(names) else _instrument(worst - len(names))
-    return consistency_check(
+    return Check.of(
         "joint-moves", "reconciliation: moves of what is stated", float(moved[worst]), 0.0, MOST_MOVED_SD,
         f"vehicle and instruments are as stated; largest: {name}, {moved[worst]:.1f} sd",
         f"{name} is {moved[worst]:.1f} sd from what is stated",
@@ -368,32 +358,35 @@ def _instrument(number: int) -> str:
     return "rates' errors" if number < 9 else "accelerometer's errors"
 
 
-def _spans(fit: JointFit) -> ConsistencyCheck:
+def _spans(fit: JointFit) -> Check:
     """Number of spans that do not match their measurements or their neighbours."""
     count = int(mismatched_spans(fit).sum())
     bad = f"{count} of {fit.problem.measured.spans} spans do not match sensors or neighbours"
-    return consistency_check(
+    return Check.of(
         "joint-spans", "reconciliation: spans", count, 0.0, 0.0, "all spans match sensors and neighbours", bad,
         advice="the motion between them is not the fitted joint's",
     )  # fmt: skip
 
 
-def _steps(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
-    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded."""
+def _steps(fit: JointFit) -> tuple[Check, ...]:
+    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded.
+
+    Half a sd widens an interval by an eighth; the fit corrects what is above a tenth.
+    """
     if fit.problem.held:
         return ()
     moved = np.abs(fit.moves_by_steps_sd)
     name = fit.problem.vehicle_parameters.names[int(np.argmax(moved))]
     return (
-        consistency_check(
-            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, MOST_BY_STEPS_SD,
+        Check.of(
+            "joint-steps", "reconciliation: integration steps", float(moved.max()), 0.0, 0.5,
             "finer integration steps move no estimate", f"finer integration steps move {name}",
             advice="the fit's own steps are too long for this motion: its intervals do not hold", component=name,
         ),
     )  # fmt: skip
 
 
-def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
+def _creep(fit: JointFit) -> tuple[Check, ...]:
     """How many sd of creep the fit is short of, where it has none and the joint is resolved."""
     problem = fit.problem
     if problem.motion > MOTION or problem.held:
@@ -402,7 +395,7 @@ def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     share = worst.delayed / (1.0 + worst.delayed)
     words = f"{100.0 * share:.0f} % of the compliance with a time constant of {worst.time_s:g} s"
     return (
-        consistency_check(
+        Check.of(
             "joint-creep", "reconciliation: creep of the joint", max(worst.sds, 0.0), 0.0, MOST_OFF_SD,
             "deflections follow the moment without creep",
             f"deflections lag behind the moment, as of a joint that creeps (linear estimate: {words})",
@@ -411,22 +404,22 @@ def _creep(fit: JointFit) -> tuple[ConsistencyCheck, ...]:
     )  # fmt: skip
 
 
-def _frequency(fit: JointFit, modal: ModalStiffness) -> ConsistencyCheck:
+def _frequency(fit: JointFit, modal: ModalStiffness) -> Check:
     """Stiffness by the joint's frequency against the fit's: difference of the logarithms over its sd."""
     sd = np.hypot(modal.sd_nmprad / modal.stiffness_nmprad, posterior_sd(fit)[0][0])
     off = np.log(modal.stiffness_nmprad / fit.vehicle.joint.bending_stiffness_nmprad)
     words = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
-    return consistency_check(
+    return Check.of(
         "joint-frequency", "reconciliation: stiffness by the joint's frequency", float(abs(off) / sd), 0.0, MOST_OFF_SD,
         f"the joint oscillates as fitted ({words})", f"the joint oscillates as one of {words}",
         advice=JOINT_WORDS,
     )  # fmt: skip
 
 
-def _convergence(fit: JointFit) -> ConsistencyCheck:
+def _convergence(fit: JointFit) -> Check:
     """Whether the last step had nothing left to gain."""
-    return consistency_check(
-        "joint-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
+    return Check.of(
+        "not-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
         f"converged in {fit.steps} steps", f"not converged after {fit.steps} steps",
         advice="estimates and intervals are those of the last step",
     )  # fmt: skip

@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -77,24 +78,14 @@ TOLERANCE, EARLY_TOLERANCE = 0.05, 2.0
 # in a kink of the coefficient table the cost is lowest whatever its slopes predict. So a fit ends, too, where no step
 # lowers the cost by more than `STILL` and the slopes promise less than one sd (`KINKED`)
 STILL = 0.01
-SETTLED_SD, CORRECTIONS = 0.1, 3  # of what finer integration steps would move; how often it is corrected
 # of freeplay: factors on standard deviations, and half width of the band's corners over the freeplay
 CONTINUATION = ((30.0, 1.0), (10.0, 0.5), (3.0, 0.3), (3.0, 0.1), (1.0, 0.1), (1.0, 0.05))
-PLAIN_STEPS = 2
 STARTS_RAD = np.deg2rad([0.25, 0.5, 0.1])
-MISMATCH_COST, LEAST_GAIN = 150.0, 10.0  # of a span's 60 samples with both its joins; of a new start
 # shares of the turbulence of the sounding's statistics
 SHARES = np.geomspace(0.05, 2.0, 7)
-# of creep: time constants that are tried (a factor of five apart the answers differ by less than a sd), and factors on
-# the standard deviations of the first steps, which the change from the held to the fast stiffness needs
+# of creep, that are tried: a factor of five apart the answers differ by less than a sd
 CREEP_TIMES_S = (2.0, 10.0, 50.0)
-SD_FACTORS_CREEP = (10.0, 3.0)
-USUAL_CREEP = 0.3  # delayed compliance over the spring's, until a fit has found its own
-# over the stiffness at which the stated vehicle diverges; from one to the next two steps reach
-CANDIDATES = (1.2, 1.8, 3.5, 10.0, 40.0, 200.0)
-STEPS, SD_FACTOR = 2, 30.0  # as the fit's own first step
 SPANS = 24  # about 10 s: several periods of the vehicle's own oscillation under load
-FAST_RATIO = 0.1  # of critical damping
 EVERY_LOAD = 20  # samples of the pulse, of which there are thousands
 
 
@@ -293,7 +284,8 @@ def _linearized_with_creep(plain: Problem, known: Linearization, problem: Proble
 def _without_creep_yet(fit: JointFit, time_s: float) -> tuple[Problem, Parameters]:
     """Problem with creep of a time constant, and the fit's parameters with none of it."""
     problem, start = _with_parameters(fit, "creep", [0.0, float(np.arcsinh(1.0 / (CREEP_PER_S * time_s)))])
-    return replace(problem, creep_per_s=USUAL_CREEP / time_s), start
+    # the usual delayed compliance over the spring's, until a fit has found its own
+    return replace(problem, creep_per_s=0.3 / time_s), start
 
 
 def _with_parameters(fit: JointFit, law: str, values: list[float]) -> tuple[Problem, Parameters]:
@@ -322,7 +314,8 @@ def _with_hardening(fit: JointFit, report: Progress) -> JointFit:
 def _from_fit(problem: Problem, start: Parameters, report: Progress) -> JointFit:
     """Fit with one law more, from the parameters of a fit without it."""
     correct = reconnected if "freeplay" in problem.vehicle_parameters.laws else None
-    early = [replace(problem, sd_factor=factor) for factor in SD_FACTORS_CREEP]
+    # the change from the held to the fast stiffness needs wide standard deviations at first
+    early = [replace(problem, sd_factor=factor) for factor in (10.0, 3.0)]
     first = solve(problem, start, early, part_of(report, 0.2, 0.6), correct, EARLY_TOLERANCE)
     joint = first.vehicle.joint
     if "creep" in problem.vehicle_parameters.laws and joint.creep_share > 0.0:
@@ -427,8 +420,8 @@ def _with_fine_steps(fit: JointFit, correct: Correction | None) -> JointFit:
     In a vehicle that spins with a joint bent by many degrees the steps' error couples the stiff twist into the bending:
     with 13 to 23 deg at 49 to 60 rpm the damping is 7 to 20 % low (4 to 10 sd).
     """
-    for _ in range(CORRECTIONS):
-        if fit.problem.held or np.abs(fit.moves_by_steps_sd).max() < SETTLED_SD:
+    for _ in range(3):
+        if fit.problem.held or np.abs(fit.moves_by_steps_sd).max() < 0.1:
             break
         fit = solve(fit.finer, fit.parameters, correct=correct)
     return fit
@@ -489,7 +482,7 @@ def reconcile_with_freeplay(
     problem = problem_of(flight, measured, laws)
     plain = problem_of(flight, measured, tuple(law for law in laws if law != "freeplay"))
     wide = replace(plain, sd_factor=CONTINUATION[0][0])
-    *_, first = descend([wide] * PLAIN_STEPS, plain.start())
+    *_, first = descend([wide] * 2, plain.start())
     early = [
         replace(problem, sd_factor=factor, vehicle_parameters=replace(problem.vehicle_parameters, corner=corner))
         for factor, corner in CONTINUATION
@@ -532,7 +525,8 @@ def _refit_mismatched(fit: JointFit) -> JointFit:
 
 def mismatched_spans(fit: JointFit) -> FloatArray:
     """Mask (s,) of the spans that are far from their measurements or from their neighbours."""
-    return np.asarray(_local_cost(fit.residuals.sensors, fit.residuals.joins) > MISMATCH_COST)
+    # a span has 60 samples and two joins
+    return np.asarray(_local_cost(fit.residuals.sensors, fit.residuals.joins) > 150.0)
 
 
 def _local_cost(sensors: FloatArray, joins: FloatArray) -> FloatArray:
@@ -554,7 +548,8 @@ def reconnected(problem: Problem, u: Parameters) -> Parameters:
     gain[0] = 0.0
     motion = u.motion.copy()
     for k in np.argsort(-gain):
-        if gain[k] > LEAST_GAIN and gain[k] >= gain[max(k - 1, 0) : k + 2].max():
+        # a new start is worth the change from a decrease of the cost by 10 on
+        if gain[k] > 10.0 and gain[k] >= gain[max(k - 1, 0) : k + 2].max():
             motion[k] = ends[k]
     moved = replace(u, motion=motion)
     return moved if problem.residuals(moved).cost < now.cost else u
@@ -571,14 +566,21 @@ def stiffness_guess(flight: Reconstruction, problem: Problem) -> tuple[Problem, 
     start, nominal = problem.start(), problem.vehicle_parameters.nominal
     measured = loaded_part(problem.measured)
     air = AtmosphereParameters(flight.telemetry.sounding, float(measured.altitude_m.min()))
-    part = replace(problem, measured=measured, air=air, sd_factor=SD_FACTOR)
+    part = replace(problem, measured=measured, air=air, sd_factor=30.0)
     lowest, best, critical = np.inf, None, critical_stiffness(flight)
-    for factor in CANDIDATES:
+
+    def with_stiffness(parameter: float) -> FloatArray:
         vehicle = start.vehicle.copy()
-        vehicle[0] = np.log(factor * critical / nominal.joint.bending_stiffness_nmprad) / STIFFNESS_LOG_SD
+        vehicle[0] = parameter
         vehicle[1] = damping_guess(problem, vehicle)
+        return vehicle
+
+    # over the stiffness at which the stated vehicle diverges; from one to the next two steps reach
+    for factor in (1.2, 1.8, 3.5, 10.0, 40.0, 200.0):
+        stiffness = factor * critical / nominal.joint.bending_stiffness_nmprad
+        vehicle = with_stiffness(float(np.log(stiffness)) / STIFFNESS_LOG_SD)
         try:
-            *_, end = descend([resolved(part, vehicle)] * STEPS, replace(part.start(), vehicle=vehicle))
+            *_, end = descend([resolved(part, vehicle)] * 2, replace(part.start(), vehicle=vehicle))
         except DivergenceError as fault:
             failed = fault
             continue
@@ -586,9 +588,7 @@ def stiffness_guess(flight: Reconstruction, problem: Problem) -> tuple[Problem, 
             lowest, best = end.residuals.cost, end.end.vehicle[0]
     if best is None:
         raise failed
-    vehicle = start.vehicle.copy()
-    vehicle[0] = best
-    vehicle[1] = damping_guess(problem, vehicle)
+    vehicle = with_stiffness(best)
     return resolved(problem, vehicle), replace(start, vehicle=vehicle)
 
 
@@ -609,7 +609,7 @@ def damping_guess(problem: Problem, x: FloatArray) -> float:
     if steps_for(vehicle) is SLOW_JOINT:
         return 0.0
     ratio = vehicle.joint.bending_damping_nmsprad / vehicle.critical_damping_nmsprad()
-    return max(0.0, float(np.log(FAST_RATIO / ratio)) / DAMPING_LOG_SD)
+    return max(0.0, float(np.log(0.1 / ratio)) / DAMPING_LOG_SD)  # a tenth of critical damping
 
 
 def critical_stiffness(flight: Reconstruction) -> float:
@@ -626,17 +626,7 @@ def loaded_part(measured: Measurements) -> Measurements:
     peak = int(np.argmax(measured.dynamic_pressure_pa))
     first = max(min(peak - SPANS // 2, measured.spans - SPANS), 0)
     part = slice(first, min(first + SPANS, measured.spans))
-
-    def of(values: FloatArray) -> FloatArray:
-        return values[part]
-
-    return replace(
-        measured,
-        start=resample(measured.start, measured.start.time_s[part.start : part.stop + 1]),
-        dynamic_pressure_pa=of(measured.dynamic_pressure_pa),
-        altitude_m=of(measured.altitude_m),
-        time_s=of(measured.time_s),
-        rate_radps=of(measured.rate_radps),
-        specific_force_mps2=of(measured.specific_force_mps2),
-        first_deflection_sd=LOADED_SD,
-    )
+    start = resample(measured.start, measured.start.time_s[part.start : part.stop + 1])
+    names = ("dynamic_pressure_pa", "altitude_m", "time_s", "rate_radps", "specific_force_mps2")
+    of_part: dict[str, Any] = {name: getattr(measured, name)[part] for name in names}
+    return replace(measured, start=start, first_deflection_sd=LOADED_SD, **of_part)

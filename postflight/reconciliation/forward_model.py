@@ -51,30 +51,21 @@ from synthetic_flight._kernels import CREEP_STATES
 from synthetic_flight.dynamics import check_step, joint_modes
 from synthetic_flight.ensemble import LANES, available_cores, check_mass
 
-# at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz; coarser in thin air
-KNOT_M, UPPER_KNOT_M = 125.0, 250.0
+KNOT_M = 125.0  # at 1200 m/s a tenth of a second: knots resolve gusts at the joint's 2 to 4 Hz
 TEMPERATURE_KNOT_M = 1e3  # of a correlation length of 5 km; by Mach number it moves the coefficients, slowly
 UPPER_M, TOP_M, BELOW_M = 75e3, 105e3, 1e3
 # a priori standard deviations; of factors those of their logarithms
 STIFFNESS_LOG_SD, DAMPING_LOG_SD, OFFSET_SD_M = 1.5, 1.0, 0.005
-LOCK_LOG = 30.0  # a spring stiffer by e^30 is a lock: a trial step ends there before numbers overflow
-LEAST_INERTIA = 0.01  # of the stated one: a trial step never makes an inertia negative
 FREEPLAY_SD_RAD, HARDENING_SD = np.deg2rad(0.5), 1.0
 # hardening is counted as the share by which the tangent stiffness has grown at this angle; negative: it softens
 HARDENING_AT_RAD = np.deg2rad(4.0)
 # creep by how fast it grows, delayed compliance over the spring's and over the time constant, and how fast it settles,
 # 1 / time constant: of creep slower than the flight the growth is measured and the rest is not, so that both follow
 # from the data by nearly straight lines. Both as sinh of the parameter: one sd is 0.06 1/s, four are 1.4 1/s
-CREEP_PER_S, LEAST_SETTLING_PER_S = 0.05, 1.0 / 300.0
-# delayed compliance over the spring's, and rates, that a trial step makes at most: a joint that runs away from its load
-# is none, and a vehicle file has no share above 0.9 and no time constant below 0.1 s
-LEAST_CREEP, MOST_CREEP, MOST_PER_S = -0.5, 9.0, 10.0
+CREEP_PER_S = 0.05
 JOINT = ("stiffness", "damping", "offset y", "offset z", "static stability")
-LAWS = {
-    "freeplay": ("freeplay",),
-    "hardening": ("hardening",),
-    "creep": ("creep growth", "creep settling"),
-}  # and parameters
+# laws, and their parameters
+LAWS = {"freeplay": ("freeplay",), "hardening": ("hardening",), "creep": ("creep growth", "creep settling")}
 NUISANCE = (
     "C_A", "C_N", "C_mq", "mass of the shell", "mass of the centerbody", "station of the shell's c.g.",
     "station of the centerbody's c.g.", "shell's c.g. y", "shell's c.g. z", "inertia of the shell",
@@ -125,7 +116,8 @@ class VehicleParameters:
         """Vehicle of parameters (v,), with nominal coefficients (`factors` scales them)."""
         nominal, known, v = self.nominal, self.nominal.uncertainty, dict(zip(self.names, x.tolist(), strict=True))
         joint, shell, body = nominal.joint, nominal.aeroshell, nominal.centerbody
-        stiffer = min(STIFFNESS_LOG_SD * v["stiffness"], LOCK_LOG)
+        # a spring stiffer by e^30 is a lock: a trial step ends there before numbers overflow
+        stiffer = min(STIFFNESS_LOG_SD * v["stiffness"], 30.0)
         stiffness = joint.bending_stiffness_nmprad * np.exp(stiffer)
         # the parameter is the damping ratio: at a given ratio damping grows with the root of the stiffness
         damping = joint.bending_damping_nmsprad * np.exp(DAMPING_LOG_SD * v["damping"] + 0.5 * stiffer)
@@ -163,11 +155,15 @@ class VehicleParameters:
 
 
 def creep_law(growth: float, settling: float) -> tuple[float, float]:
-    """Share of the compliance that comes late, and its time constant, s, of the two parameters."""
-    most = np.arcsinh(MOST_PER_S / CREEP_PER_S)
+    """Share of the compliance that comes late, and its time constant, s, of the two parameters.
+
+    Rates are 10 1/s at most, time constants 300 s, and the delayed compliance is -0.5 to 9 times the spring's: a joint
+    that runs away from its load is none, and a vehicle file has no share above 0.9 and no time constant below 0.1 s.
+    """
+    most = np.arcsinh(10.0 / CREEP_PER_S)
     grows, settles = CREEP_PER_S * np.sinh(np.clip([growth, settling], -most, most))
-    time_s = float(1.0 / np.hypot(LEAST_SETTLING_PER_S, settles))
-    delayed = float(np.clip(grows * time_s, LEAST_CREEP, MOST_CREEP))
+    time_s = float(1.0 / np.hypot(1.0 / 300.0, settles))
+    delayed = float(np.clip(grows * time_s, -0.5, 9.0))
     return delayed / (1.0 + delayed), time_s
 
 
@@ -180,20 +176,18 @@ def _perturbed(
     """
     x, y, z = part.cg_from_datum_body_m
     axial, across = (1.0 + known.inertia * v[f"{kind}inertia of the {name}"] for kind in ("axial ", ""))
-    root = np.sqrt(np.maximum([axial, across, across], LEAST_INERTIA))
+    # at least a hundredth of the stated one: a trial step never makes an inertia negative
+    root = np.sqrt(np.maximum([axial, across, across], 0.01))
     inertia = part.inertia * np.outer(root, root)
     if f"{name}'s product xy" in v:
         size = known.inertia_products * 0.5 * (part.inertia[1, 1] + part.inertia[2, 2])
         for row, column, axes in ((0, 1, "xy"), (0, 2, "xz"), (1, 2, "yz")):
             inertia[row, column] += size * v[f"{name}'s product {axes}"]
             inertia[column, row] = inertia[row, column]
+    x += known.cg_station_m * v[f"station of the {name}'s c.g."]
     moved = {
         "mass_kg": part.mass_kg * (1.0 + known.mass * v[f"mass of the {name}"]),
-        "cg_from_datum_body_m": (
-            x + known.cg_station_m * v[f"station of the {name}'s c.g."],
-            y + float(lateral_m[0]),
-            z + float(lateral_m[1]),
-        ),
+        "cg_from_datum_body_m": (x, y + float(lateral_m[0]), z + float(lateral_m[1])),
         "inertia_kgm2": tuple(map(tuple, inertia.tolist())),
     }
     return part.model_copy(update=moved)
@@ -222,7 +216,7 @@ class AtmosphereParameters:
     def knots_m(self) -> FloatArray:
         """Altitudes (k,) at which the atmosphere may differ from the sounding."""
         lower = np.arange(UPPER_M, min(self.lowest_m, UPPER_M) - BELOW_M, -KNOT_M)[:0:-1]
-        return np.concatenate([lower, np.arange(UPPER_M, TOP_M, UPPER_KNOT_M)])
+        return np.concatenate([lower, np.arange(UPPER_M, TOP_M, 2.0 * KNOT_M)])  # coarser in thin air
 
     @cached_property
     def temperature_knots_m(self) -> FloatArray:
@@ -294,30 +288,23 @@ class AtmosphereParameters:
         return table
 
     def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
-        """Rows of a kernel table that change where one difference (log density, north, east wind) moves at one knot."""
-        near, hat = self._hats[knot]
+        """Rows of a kernel table that change where log density, north, east wind or temperature moves at one knot."""
+        near, hat = self._hats[kind == 3][knot]
         rows, change = table[near].copy(), step * hat
         if kind == 0:
             rows[:, 0] *= np.exp(change)
             rows[:-1, 1] += change[1:] - change[:-1]
+        elif kind == 3:
+            rows[:, 2] *= np.exp(0.5 * change / self._sounded[2][near])
         else:
             rows[:, 2 + kind] += change
         return MovedRows(near.start, rows)
 
-    def warmed_rows(self, table: FloatArray, knot: int, step_k: float) -> MovedRows:
-        """Rows of a kernel table that change where the temperature moves at one of its knots."""
-        near, hat = self._temperature_hats[knot]
-        rows = table[near].copy()
-        rows[:, 2] *= np.exp(0.5 * step_k * hat / self._sounded[2][near])
-        return MovedRows(near.start, rows)
-
     @cached_property
-    def _hats(self) -> list[tuple[slice, FloatArray]]:
-        return hats(self._sounded[1], self.knots_m)
-
-    @cached_property
-    def _temperature_hats(self) -> list[tuple[slice, FloatArray]]:
-        return hats(self._sounded[1], self.temperature_knots_m)
+    def _hats(self) -> tuple[list[tuple[slice, FloatArray]], list[tuple[slice, FloatArray]]]:
+        """`hats` of the knots, and of the temperature's."""
+        rows_m = self._sounded[1]
+        return hats(rows_m, self.knots_m), hats(rows_m, self.temperature_knots_m)
 
 
 def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArray]]:
@@ -337,25 +324,12 @@ class MovedRows:
     rows: FloatArray
 
 
-START_ALTITUDE_M = 100e3
 WINDOW_S = 0.04  # passes 98 % of the joint's oscillation at 2.5 Hz; the simulated flight is averaged alike
 WINDOWS = 10  # a span
 SPAN_S = WINDOWS * WINDOW_S
-SPAN_MARGIN_M = 200.0  # of the air about a span, beside what it falls through
 LEAST_SPANS = 20
-LARGEST_PART = 16  # blocks that a thread flies in a row: about three spans of a linearisation
-LEAST_PARTS = 8  # where there are blocks enough: a few for each thread
-LOADED = 0.1  # of the largest dynamic pressure
 # a priori sd of deflection and its rate (about x, y, z) at the first start: at rest above the atmosphere; under load
 REST_SD, LOADED_SD = np.deg2rad([1e-3, 0.1, 0.1, 0.1, 1.0, 1.0]), np.deg2rad([1e-3, 3.0, 3.0, 0.1, 30.0, 30.0])
-
-
-MOST_PHASE_RAD = 0.8  # of the joint's bending in a step, with an error of a percent a radian; unstable from 2.8
-# damping ratio of a mode that windows do not resolve: its oscillation decays within a few windows, and deflections lag
-# their load by few milliseconds. From so many periods a window (10.7 Hz) it grows, over so many more (to 12.5 Hz)
-UNRESOLVED_RATIO, UNRESOLVED_FROM, UNRESOLVED_BLEND = 0.2, 0.43, 0.07
-# periods a window (10.2 Hz) up to which a stiffness can be found: a fit of a faster joint ends at the next
-RESOLVED = 0.41
 
 
 @dataclass(frozen=True)
@@ -386,13 +360,13 @@ class WindowSteps:
 
 SLOW_JOINT, FAST_JOINT = WindowSteps(2, 2), WindowSteps(4, 2)
 FINE = WindowSteps(4, 8)  # resolve the joint's twist too: twice as long they leave half a sd of the damping
-FAST_HZ = 6.0  # a window's mean of a faster oscillation is off by more than half a percent with two intervals
 
 
 def steps_for(vehicle: Vehicle) -> WindowSteps:
     """Steps that resolve a vehicle's bending: a mean of too few records mistakes a fast oscillation for an offset."""
     inertia, _, stiffness = joint_modes(vehicle)["bending"]
-    return SLOW_JOINT if np.sqrt(stiffness / inertia) < 2.0 * np.pi * FAST_HZ else FAST_JOINT
+    # a window's mean of an oscillation faster than 6 Hz is off by more than half a percent with two intervals
+    return SLOW_JOINT if np.sqrt(stiffness / inertia) < 2.0 * np.pi * 6.0 else FAST_JOINT
 
 
 @dataclass(frozen=True)
@@ -463,11 +437,11 @@ def select_measurements(flight: Reconstruction, loaded: bool = False) -> Measure
     """
     pulse, bet, air = flight.required_loads(), flight.solution, flight.air
     accelerometer, rates = flight.telemetry.required_triads()
-    falling = (air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0)
+    falling = (air.altitude_m < 100e3) & (air.flight_path_angle_rad < 0.0)
     if loaded:
-        falling &= air.dynamic_pressure_pa > LOADED * pulse.dynamic_pressure_pa.max()
+        falling &= air.dynamic_pressure_pa > 0.1 * pulse.dynamic_pressure_pa.max()
     if not falling.any():
-        raise GateError("reconciliation: the reconstruction never comes below 100 km", code="entry-missing")
+        raise GateError("reconciliation: the reconstruction never comes below 100 km", code="time-not-covered")
     first_s = float(np.ceil(air.time_s[np.argmax(falling)] / WINDOW_S) * WINDOW_S)
     last_s = float(pulse.time_s[np.flatnonzero(pulse.through_pulse)[-1]])
     spans = int((last_s - first_s) / SPAN_S)
@@ -615,11 +589,14 @@ def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
     joint is so much damped that it follows its load.
     """
     inertia, _, stiffness = joint_modes(vehicle)["bending"]
-    most = inertia * (MOST_PHASE_RAD / steps.step_s) ** 2
+    # of the joint's bending in a step 0.8 rad at most, with an error of a percent a radian; unstable from 2.8
+    most = inertia * (0.8 / steps.step_s) ** 2
     # smooth, so that steps of a fit see where it ends; a tenth of the limit is lowered by 3e-5
     limited = stiffness / (1.0 + (stiffness / most) ** 4) ** 0.25
     frequency = np.sqrt(limited / inertia) / (2.0 * np.pi)
-    ratio = UNRESOLVED_RATIO * np.clip((frequency * WINDOW_S - UNRESOLVED_FROM) / UNRESOLVED_BLEND, 0.0, 1.0)
+    # a mode that windows do not resolve has a damping ratio of 0.2: its oscillation decays within a few windows, and
+    # deflections lag their load by few milliseconds. The ratio grows from 0.43 periods a window (10.7 Hz) to 0.5
+    ratio = 0.2 * np.clip((frequency * WINDOW_S - 0.43) / 0.07, 0.0, 1.0)
     damping = max(vehicle.joint.bending_damping_nmsprad, float(ratio * 2.0 * np.sqrt(limited * inertia)))
     changed = {"bending_stiffness_nmprad": limited, "bending_damping_nmsprad": damping}
     return replace(vehicle, joint=vehicle.joint.model_copy(update=changed))
@@ -627,7 +604,8 @@ def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
 
 def resolved_stiffness_nmprad(vehicle: Vehicle) -> float:
     """Bending stiffness, N m/rad, above which the windows do not resolve the joint's oscillation."""
-    return float(joint_modes(vehicle)["bending"][0] * (2.0 * np.pi * RESOLVED / WINDOW_S) ** 2)
+    # up to 0.41 periods a window (10.2 Hz) a stiffness can be found: a fit of a faster joint ends at the next
+    return float(joint_modes(vehicle)["bending"][0] * (2.0 * np.pi * 0.41 / WINDOW_S) ** 2)
 
 
 def fly_spans(measured: Measurements, nominal: Vehicle, flights: SpanFlights) -> PredictedSpans:
@@ -674,7 +652,8 @@ def _parts(flights: int) -> list[slice]:
     machine: where a part's air begins is seen in the last bits.
     """
     blocks = -(-flights // LANES)
-    size = LANES * min(LARGEST_PART, -(-blocks // LEAST_PARTS))
+    # 16 blocks in a row at most, about three spans of a linearisation; at least 8 parts, a few for each thread
+    size = LANES * min(16, -(-blocks // 8))
     return [slice(begin, min(begin + size, flights)) for begin in range(0, flights, size)]
 
 
@@ -692,7 +671,8 @@ def _rows_passed(measured: Measurements, flights: SpanFlights) -> tuple[Index, I
 
     A span that leaves them by a trial vehicle's tumbling meets the air at their ends.
     """
-    passed = np.abs(np.gradient(measured.altitude_m)) + SPAN_MARGIN_M
+    # beside what a span falls through, 200 m of air about it
+    passed = np.abs(np.gradient(measured.altitude_m)) + 200.0
     ends = np.stack([measured.altitude_m - passed, measured.altitude_m + passed])
     low, high = (ends - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M
     count = len(flights.air)
@@ -715,16 +695,10 @@ def _start_states(measured: Measurements, flights: SpanFlights) -> FloatArray:
     v = at.velocity_ecef_mps[span] + motion[:, VELOCITY] + rotations.rotate(q, velocity)
     to_eci = rotations.conjugate(earth.q_ecef_eci(at.time_s[span]))
     q_body = rotations.multiply(to_eci, q)
+    inertial = rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r))
+    q_shell = rotations.multiply(q_body, q_body_shell)
     return np.column_stack(
-        [
-            rotations.rotate(to_eci, r),
-            rotations.rotate(to_eci, v + np.cross(earth.OMEGA_ECEF_RADPS, r)),
-            q_body,
-            rotations.multiply(q_body, q_body_shell),
-            omega,
-            shell_rate,
-            motion[:, CREEP],
-        ]
+        [rotations.rotate(to_eci, r), inertial, q_body, q_shell, omega, shell_rate, motion[:, CREEP]]
     )
 
 
@@ -752,13 +726,6 @@ def _ends(measured: Measurements, flights: SpanFlights, state: FloatArray) -> Fl
     _, from_datum = _cg_from_datum(flights, omega, q_body_shell, shell)
     r, v = rotations.rotate(to_ecef, state[:, 0:3]), rotations.rotate(to_ecef, state[:, 3:6])
     velocity = v - np.cross(earth.OMEGA_ECEF_RADPS, r) - rotations.rotate(q, from_datum)
-    return np.column_stack(
-        [
-            rotations.boxminus(q, at.q_ecef_body[span + 1]),
-            omega,
-            rotations.log(q_body_shell),
-            shell - rotations.rotate(rotations.conjugate(q_body_shell), omega),
-            velocity - at.velocity_ecef_mps[span + 1],
-            state[:, 20:],
-        ]
-    )
+    attitude, velocity = rotations.boxminus(q, at.q_ecef_body[span + 1]), velocity - at.velocity_ecef_mps[span + 1]
+    shell_rate = shell - rotations.rotate(rotations.conjugate(q_body_shell), omega)
+    return np.column_stack([attitude, omega, rotations.log(q_body_shell), shell_rate, velocity, state[:, 20:]])

@@ -59,14 +59,9 @@ VACUUM_SD = np.append(
     np.deg2rad([0.001, 0.001, 0.001, 0.003, 0.003, 0.003, 1e-4, 0.001, 0.001, 0.03, 0.01, 0.01]), [1e-3, 1e-3, 1e-3]
 )
 GUST_KNOT_M = 300.0
-LARGE_ANGLE_RAD = np.deg2rad(5.0)  # angle of attack at which density structure rotates the vehicle
-GUST_RATE, GUST_FORCE_MPS2 = 2.0, 60.0  # of the windows' rates and lateral force, as if white from window to window
-# what a gust does to the deflection comes late for half a span on average; `Problem.creep_per_s` of it in a second
-GUST_CREEP_S, VACUUM_CREEP_SD = 0.5 * SPAN_S * GUST[7], np.deg2rad(2e-5)
 MOTION_STEP = np.append(np.deg2rad(np.repeat([2e-5, 5e-5, 2e-5, 2e-4], 3)), [1e-3, 1e-3, 1e-3])
-CREEP_STEP = np.deg2rad(2e-5)
 LEAST_COMPLIANCE = 0.5  # of a joint's compliance: a step that lessens it by more is shortened
-VEHICLE_STEP, AIR_STEP, WARMTH_STEP_K = 1e-5, np.array([1e-6, 2e-4, 2e-4]), 1e-2
+VEHICLE_STEP, AIR_STEP = 1e-5, np.array([1e-6, 2e-4, 2e-4, 1e-2])
 
 
 @dataclass(frozen=True)
@@ -194,7 +189,8 @@ class Problem:
         density, wind = self.air.unresolved_structure(measured.altitude_m)
         speed = np.linalg.norm(measured.start.velocity_ecef_mps[:-1], axis=1)
         load = measured.dynamic_pressure_pa / measured.dynamic_pressure_pa.max()
-        return np.asarray(load * correlated * np.hypot(wind / speed, density * LARGE_ANGLE_RAD))
+        # density structure rotates the vehicle at angles of attack of 5 deg
+        return np.asarray(load * correlated * np.hypot(wind / speed, density * np.deg2rad(5.0)))
 
     @cached_property
     def data(self) -> FloatArray:
@@ -208,8 +204,9 @@ class Problem:
         size = np.abs(measured.specific_force_mps2)
         density, _ = self.air.unresolved_structure(measured.altitude_m)
         gust = self.turbulence_rad[:, None, None]
-        rate_sd = np.hypot(measured.rate_sd_radps, GUST_RATE * gust) * np.ones_like(size)
-        unresolved = np.hypot(density[:, None, None] * size, GUST_FORCE_MPS2 * gust)
+        # what gusts do to the rates (2 1/s) and to the lateral force (60 m/s^2) is as if white from window to window
+        rate_sd = np.hypot(measured.rate_sd_radps, 2.0 * gust) * np.ones_like(size)
+        unresolved = np.hypot(density[:, None, None] * size, 60.0 * gust)
         force_sd = np.hypot(measured.force_sd_mps2, unresolved)
         weight = 1.0 / (self._sd_factors[:, None, None] * np.concatenate([rate_sd, force_sd], axis=2))
         return np.where(np.isfinite(measured.specific_force_mps2[..., :1]), np.nan_to_num(weight), 0.0)
@@ -219,16 +216,15 @@ class Problem:
         """Inverse standard deviations (s - 1, motion) of ends against starts."""
         factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
         more = self.motion - MOTION
-        gust, vacuum = (
-            np.append(GUST, [GUST_CREEP_S * self.creep_per_s] * more),
-            np.append(VACUUM_SD, [VACUUM_CREEP_SD] * more),
-        )
+        # what a gust does to the deflection comes late for half a span on average
+        late = 0.5 * SPAN_S * GUST[7] * self.creep_per_s
+        gust, vacuum = np.append(GUST, [late] * more), np.append(VACUUM_SD, [np.deg2rad(2e-5)] * more)
         return np.asarray(1.0 / (factor[:, None] * np.hypot(gust * self.turbulence_rad[:-1, None], vacuum)))
 
     @property
     def motion_step(self) -> FloatArray:
         """Steps (motion,) over which derivatives by a span's start are taken."""
-        return np.append(MOTION_STEP, [CREEP_STEP] * (self.motion - MOTION))
+        return np.append(MOTION_STEP, [np.deg2rad(2e-5)] * (self.motion - MOTION))
 
     @property
     def log_weight(self) -> float:
@@ -473,15 +469,10 @@ class Problem:
     def _moved_air(self, air: FloatArray, which: Index) -> tuple[list[MovedRows], FloatArray]:
         """What changes in a kernel table where parameters of the air (k,) move, counted from its first; their steps."""
         knots = len(self.air.knots_m)
-        kinds = np.minimum(which // knots, len(AIR_STEP))
-        steps = np.append(AIR_STEP, WARMTH_STEP_K)[kinds]
-        moved = [
-            self.air.moved_rows(air, kind, knot, step)
-            if kind < len(AIR_STEP)
-            else self.air.warmed_rows(air, knot, step)
-            for kind, knot, step in zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
-        ]
-        return moved, steps
+        kinds = np.minimum(which // knots, 3)
+        steps = AIR_STEP[kinds]
+        each = zip(kinds.tolist(), (which - knots * kinds).tolist(), steps.tolist(), strict=True)
+        return [self.air.moved_rows(air, *one) for one in each], steps
 
     @cached_property
     def _passed_knots(self) -> list[Index]:
@@ -511,11 +502,7 @@ class Problem:
         ]
 
 
-STEP_FRACTIONS = (1.0, 0.5, 0.25)  # of a step
 LOOK_AHEAD = 0.1  # of a step, over which its curvature is taken
-# shares of the diagonal that are added, until the cost falls by a fair part of the undamped step's predicted decrease
-DAMPINGS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
-FIRST_DAMPING, MOST_DAMPING, FAIR = 1e-2, 1e3, 0.5
 # predicted decrease by a step of one sd in all. A shorter one is not damped while it lowers the cost at all: what is
 # left of its prediction is the coefficient table's kinks at its Mach numbers, which no damping takes away
 KINKED = 1.0
@@ -550,12 +537,13 @@ def step_from(problem: Problem, u: Parameters) -> Step:
     normal = problem.normal_equations(u, linear)
     predicted_decrease = float(normal.solve(normal.right) @ normal.right)
     best = linear.residuals, u
-    for damping in DAMPINGS:
+    # shares of the diagonal that are added, until the cost falls by half of the undamped step's predicted decrease
+    for damping in (0.0, 1e-6, 1e-5, 1e-4, 1e-3):
         best = _better(problem, u, linear, normal, damping, best)
-        if linear.residuals.cost - best[0].cost > FAIR * predicted_decrease or predicted_decrease < KINKED:
+        if linear.residuals.cost - best[0].cost > 0.5 * predicted_decrease or predicted_decrease < KINKED:
             break
-    damping = FIRST_DAMPING
-    while best[0].cost >= linear.residuals.cost and damping < MOST_DAMPING:
+    damping = 1e-2
+    while best[0].cost >= linear.residuals.cost and damping < 1e3:
         best = _better(problem, u, linear, normal, damping, best)
         damping *= 10.0
     return Step(best[1], predicted_decrease, best[0], normal)
@@ -581,7 +569,7 @@ def _better(
     if np.isfinite(bend).all():
         # a curved path, whose straight part alone may go too far
         curvature = solved(bend)
-        paths = [part * step + 0.5 * part**2 * curvature for part in STEP_FRACTIONS]
+        paths = [part * step + 0.5 * part**2 * curvature for part in (1.0, 0.5, 0.25)]
     ends = [u.plus(path) for path in paths]
     return min([best, *zip(problem.residuals_of(ends), ends, strict=True)], key=lambda pair: pair[0].cost)
 

@@ -84,7 +84,7 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
     use = pressure > LEAST_PRESSURE_PA
     if use.sum() < BLOCKS:
         message = f"modes: {use.sum()} windows with more than {LEAST_PRESSURE_PA:g} Pa; {BLOCKS} are wanted"
-        raise GateError(message, code="pulse-too-short")
+        raise GateError(message, code="too-few-data")
     t, log_power, pressure = t[use], log_power[use], pressure[use]
     flow = pressure, np.interp(t, pulse.time_s, pulse.mach), np.interp(t, pulse.time_s, pulse.airspeed_mps)
     frequency = np.asarray(np.fft.fftfreq(PADDED, 1.0 / RATE_HZ), dtype=np.float64)
@@ -95,13 +95,13 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
             f"modes: largest mean logarithm of power over noise {mean_log_power.max():.2f}, at least "
             f"{LEAST_LOG_POWER:g} is wanted: the joint's oscillation cannot be detected in the pulse"
         )
-        raise GateError(message, code="mode-not-detected")
+        raise GateError(message, code="not-observable")
     if not EDGE <= np.argmax(mean_log_power) < len(FACTORS) - EDGE:
         message = (
             f"modes: from {FACTORS[0] * about_nmprad:.0f} to {FACTORS[-1] * about_nmprad:.0f} N m/rad the power along "
             "the joint's frequency is largest at an end: the line is another one's"
         )
-        raise GateError(message, code="mode-not-detected")
+        raise GateError(message, code="not-observable")
     best = _peak(mean_log_power)
     parts = np.array_split(np.arange(len(t)), BLOCKS)
     without = np.array([_peak(np.delete(power, part, axis=1).mean(axis=1)) for part in parts])
@@ -137,7 +137,7 @@ def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, Fl
     if len(grid) < WINDOW + HOP:
         raise GateError(
             f"modes: {len(grid) / RATE_HZ:.1f} s of pulse; at least {(WINDOW + HOP) / RATE_HZ:.1f} s are wanted",
-            code="pulse-too-short",
+            code="too-few-data",
         )
     rate = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.rate_body_radps.T])
     force = np.column_stack([np.interp(grid, bet.imu_time_s, c) for c in bet.specific_force_body_mps2.T])

@@ -3,18 +3,17 @@
 From the linear problem: covariance ``P = (J^T W J + P_0^-1)^-1`` of all parameters, and by differences the standard
 deviations and 90 % intervals of what an engineer asks for.
 
-By sampling: posterior of the few parameters sought by emcee, its volume by dynesty. The nuisance parameters (some 2700:
+By sampling: posterior of the few parameters sought, by emcee. The nuisance parameters (some 2700:
 motion, atmosphere, instruments, masses) are put at their most probable values for each candidate of the few (a profile
 likelihood). To that end they follow the linear problem about the best fit and are then corrected by the gradient at the
 candidate with the derivatives of the best fit, which costs one flight of all spans a correction. The profile is taken
-at some two hundred candidates and interpolated between them by radial functions; the samplers evaluate the
+at some two hundred candidates and interpolated between them by radial functions; the sampler evaluates the
 interpolation, whose error is `Posterior.refit_error`: candidates fitted anew with new derivatives. A profile is no
 marginal: that the scatter of the nuisance parameters differs from candidate to candidate is neglected.
 
 References
 ----------
-D. Foreman-Mackey et al., "emcee: The MCMC Hammer", 2013. J. S. Speagle, "dynesty: a dynamic nested sampling package",
-2020.
+D. Foreman-Mackey et al., "emcee: The MCMC Hammer", 2013.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import RBFInterpolator
 from scipy.special import ndtr, ndtri
 
-from flightmodel.checks import ConfigError, FloatArray, Progress, part_of
+from flightmodel.checks import ConfigError, FloatArray, Progress
 from flightmodel.deflection import DeflectionHistory, history_from_lateral, lv_clock
 from flightmodel.vehicle import Vehicle
-from postflight.reconciliation.fit import JointFit, LawSelection
+from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.forward_model import (
     DAMPING_LOG_SD,
     DEFLECTION,
@@ -62,10 +61,7 @@ SEED = 2009
 PER_UNKNOWN, REACH, CORRECTIONS = 32, 5.0, 3  # candidates; reach in sd of the linear problem
 REFITS, REFIT_STEPS, REFIT_REACH = 4, 2, 2.0
 WALKERS, MOVES, BURNT, THINNED = 32, 2500, 500, 20
-LOWEST_LOG = -1e300
-OPEN_ODDS = 20.0  # logarithm of odds beyond which no better integral changes the selection
 DIFFERENCE = 1e-4  # of an a priori standard deviation
-LIVE, LEFT = 250, 0.05  # nested sampling's live points; log evidence still to be found when it stops
 
 
 def _damping_ratio(vehicle: Vehicle) -> float:
@@ -283,10 +279,6 @@ class Posterior:
     fit : JointFit
     samples : (n, v) float
         The vehicle's parameters, a priori standard deviations; nuisance parameters follow those sought.
-    log_evidence : float
-        As `JointFit.log_evidence`, by nested sampling of the profile in place of Laplace's method.
-    log_evidence_sd : float
-        Of the nested sampling.
     refit_error : (REFITS,) float
         Interpolated cost less that of a new fit, at candidates two sd away.
     autocorrelation_steps : float
@@ -295,19 +287,16 @@ class Posterior:
 
     fit: JointFit
     samples: FloatArray
-    log_evidence: float
-    log_evidence_sd: float
     refit_error: FloatArray
     autocorrelation_steps: float
 
 
-def require_samplers() -> None:
-    """Refuse where emcee or dynesty are not installed."""
-    missing = [name for name in ("emcee", "dynesty") if find_spec(name) is None]
-    if missing:
+def require_sampler() -> None:
+    """Refuse where emcee is not installed."""
+    if find_spec("emcee") is None:
         raise ConfigError(
-            f"--posterior: {' and '.join(missing)} not installed; pip install 'postflight[posterior]', or leave the "
-            "option out: the intervals are then Gaussian",
+            "--posterior: emcee not installed; pip install 'postflight[posterior]', or leave the option out: the "
+            "intervals are then Gaussian",
             code="package-missing",
         )
 
@@ -384,9 +373,9 @@ def sample(fit: JointFit, progress: Progress | None = None) -> Posterior:
     Raises
     ------
     ConfigError
-        Where the samplers are not installed.
+        Where emcee is not installed.
     """
-    require_samplers()
+    require_sampler()
     report = progress or (lambda _fraction, _what: None)
     profile, rng = Profile(fit), np.random.default_rng(SEED)
     p = profile.count
@@ -411,11 +400,8 @@ def sample(fit: JointFit, progress: Progress | None = None) -> Posterior:
     refit_error = interpolated(away) - [profile.refitted(z) - fit.residuals.cost for z in away]
     report(0.9, "posterior: emcee")
     chain, autocorrelation = _walk(log_probability, p, rng)
-    report(0.95, "posterior: dynesty")
-    volume, volume_sd = _volume(log_probability, p)
-    evidence = fit.log_evidence + volume - 0.5 * p * np.log(2.0 * np.pi)
     report(1.0, "posterior sampled")
-    return Posterior(fit, profile.vehicles(chain), evidence, volume_sd, np.asarray(refit_error), autocorrelation)
+    return Posterior(fit, profile.vehicles(chain), np.asarray(refit_error), autocorrelation)
 
 
 def quantities(vehicle_parameters: VehicleParameters, x: FloatArray) -> pd.DataFrame:
@@ -459,25 +445,6 @@ def posterior_summary(posterior: Posterior) -> pd.DataFrame:
     return pd.DataFrame({**out, "sd": table.std().to_numpy(), "low": low, "high": high})
 
 
-def sample_selection(selection: LawSelection, progress: Progress) -> tuple[Posterior, dict[str, float]]:
-    """Posterior of the selected joint, and log odds by nested sampling where Laplace's method is not decisive."""
-    fits = [selection.fit]
-    for law, (lacking, having) in selection.compared.items():
-        if abs(selection.log_odds[law]) < OPEN_ODDS:
-            fits += [fit for fit in (lacking, having) if not any(fit is each for each in fits)]
-    sampled = [sample(fit, part_of(progress, k / len(fits), (k + 1) / len(fits))) for k, fit in enumerate(fits)]
-
-    def evidence(fit: JointFit) -> float:
-        return next((each.log_evidence for each in sampled if each.fit is fit), fit.log_evidence)
-
-    odds = {
-        law: evidence(having) - evidence(lacking)
-        for law, (lacking, having) in selection.compared.items()
-        if abs(selection.log_odds[law]) < OPEN_ODDS
-    }
-    return sampled[0], odds
-
-
 def _walk(
     log_probability: Callable[[FloatArray], FloatArray], p: int, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
@@ -491,18 +458,3 @@ def _walk(
     sampler.run_mcmc(emcee.State(start, random_state=seeded), MOVES)
     autocorrelation = sampler.get_autocorr_time(tol=0, discard=BURNT)
     return np.asarray(sampler.get_chain(discard=BURNT, thin=THINNED, flat=True)), float(np.max(autocorrelation))
-
-
-def _volume(log_probability: Callable[[FloatArray], FloatArray], p: int) -> tuple[float, float]:
-    """Logarithm of the integral of a probability whose peak is one, over the cube within reach, and its sd."""
-    import dynesty
-
-    def within(cube: FloatArray) -> FloatArray:
-        return REACH * (2.0 * cube - 1.0)
-
-    def one(z: FloatArray) -> float:
-        return max(float(log_probability(z[None])[0]), LOWEST_LOG)
-
-    sampler = dynesty.NestedSampler(one, within, p, nlive=LIVE, rstate=np.random.default_rng(SEED))
-    sampler.run_nested(dlogz=LEFT, print_progress=False)
-    return float(sampler.results.logz[-1] + p * np.log(2.0 * REACH)), float(sampler.results.logzerr[-1])

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
-from flightmodel.checks import ConfigError, Fault, GateError
+from flightmodel.checks import ConfigError, GateError, Issue
 from flightmodel.files import abandoned, partial_path, writing
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
-from postflight.plots.style import LABEL, MANY, with_holes
-from postflight.report.compare_other import OTHER_TABLES, charts, compare_with_other, print_other
-from postflight.report.panels import Panel, line_of, panel_of, quantities_drawn
+from postflight.plots.style import LABEL, MANY
+from postflight.report.compare_other import OTHER_TABLES, compare_with_other, print_other
+from postflight.report.panels import Panel, drawn_answer, line_of, panel_of, quantities_drawn
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
-from postflight.report.write import pulse_window, rendered
+from postflight.report.write import charts, pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import RunTables, find_run, is_complete, read_tables
 from postflight.systematic_differences import digits
@@ -33,7 +32,6 @@ PAGE_NAME = "compare.html"
 TABLES = ("runs", "differences", "differences_over_time", "checks")
 _FILES = {PAGE_NAME, *(f"{name}.csv" for name in (*TABLES, *OTHER_TABLES))}
 _DASHES: tuple[list[int], ...] = ([], [8, 4], [2, 3], [10, 3, 2, 3], [5, 2], [14, 4])
-_ROWS = 3000  # of a line that are drawn
 # panels of differences: title, unit, column of the table of differences over time
 _APART = (
     ("Position, distance", "m", "position_m"),
@@ -56,7 +54,7 @@ def locate(word: str) -> Path:
     Raises
     ------
     GateError
-        ``run-incomplete``, ``run-unknown`` or ``run-missing``.
+        ``run-incomplete``, ``name-unknown`` or ``run-missing``.
     """
     path = Path(word)
     is_flight = (path / "flight.toml").is_file() or (path / "runs").is_dir()
@@ -70,7 +68,7 @@ def locate(word: str) -> Path:
     if (path.parent / "flight.toml").is_file() or (path.parent / "runs").is_dir():
         return find_run(path.parent, path.name)
     words = "no run: name a run's folder, a flight's, or FLIGHT/RUN with a run's name, such as my-flight/plain"
-    raise GateError(f"{word}: {words}", "run-unknown")
+    raise GateError(f"{word}: {words}", "name-unknown")
 
 
 def compare(words: tuple[str, ...], output: Path | None) -> None:
@@ -87,15 +85,15 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
     Raises
     ------
     ConfigError
-        Too few, too many or equal runs; ``compare-one-file`` where a file does not stand behind one run.
+        Too few, too many or equal runs; ``compare-runs`` where a file does not stand behind one run.
     GateError
-        What a file is refused for; every word that means no run, runs that cannot be read; ``folder-exists`` where the
+        What a file is refused for; every word that means no run, runs that cannot be read; ``file-exists`` where the
         folder holds other things.
     """
     if any(Path(word).is_file() for word in words):
         _compare_with_file(words, output)
         return
-    faults: list[Fault] = []
+    faults: list[Issue] = []
     found = []
     for word in words:
         try:
@@ -116,7 +114,7 @@ def compare(words: tuple[str, ...], output: Path | None) -> None:
 def _compare_with_file(words: tuple[str, ...], output: Path | None) -> None:
     """Print and write the comparison of a run with another source's file."""
     if len(words) != 2 or Path(words[0]).is_file():
-        raise ConfigError("compare: a run, then one file with another trajectory, is wanted", "compare-one-file")
+        raise ConfigError("compare: a run, then one file with another trajectory, is wanted", "compare-runs")
     run, path = read_tables(locate(words[0])), Path(words[1])
     found, tables, text = compare_with_other(run, path)
     folder = output or _default_folder((run,), (path.stem,))
@@ -133,10 +131,10 @@ def _default_folder(runs: tuple[RunTables, ...], others: tuple[str, ...]) -> Pat
 def _write(folder: Path, runs: tuple[RunTables, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
     """Write everything beside the folder and rename; an earlier comparison there is replaced, nothing else."""
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= _FILES):
-        raise GateError(f"{folder}: exists and is no comparison; name another with --output", "folder-exists")
+        raise GateError(f"{folder}: exists and is no comparison; name another with --output", "file-exists")
     place = folder.resolve()
     if any(run.path.resolve().parent in (place, *place.parents) for run in runs):
-        raise GateError(f"{folder}: run folders stay as they were written; name another place", "export-into-run")
+        raise GateError(f"{folder}: run folders stay as they were written; name another place", "file-exists")
     with writing(folder, "name another folder with --output"):
         folder.parent.mkdir(parents=True, exist_ok=True)
         for left in abandoned(folder.parent, folder.name):
@@ -166,9 +164,10 @@ def print_comparison(compared: RunComparison) -> None:
     t = compared.at_s
     when = f"at {t[0]:.2f} s, peak q of 1" if compared.same_clock else "each at its own peak q"
     rows, count = value_rows(compared), len(compared.runs)
-    _print_table(f"Runs side by side, {when}; ± is 1 sd", [str(k + 1) for k in range(count)], rows)
-    names = [name for k in range(2, count + 1) for name in (f"{k} less 1", "its sd")]
-    _print_table("Differences", names, [[row[0], *row[count + 1 :]] for row in rows])
+    names = ["quantity", *(str(k + 1) for k in range(count))]
+    console.table(f"Runs side by side, {when}; ± is 1 sd", names, [row[: count + 1] for row in rows])
+    names = ["quantity", *(name for k in range(2, count + 1) for name in (f"{k} less 1", "its sd"))]
+    console.table("Differences", names, [[row[0], *row[count + 1 :]] for row in rows])
     for k, relation in enumerate(compared.relations, 2):
         console.print(escape(f"{k} and 1: {relation.words}"), highlight=False)
     if any(relation.kind == CORRELATED for relation in compared.relations):
@@ -178,17 +177,6 @@ def print_comparison(compared: RunComparison) -> None:
         words = f"{label}: {int(passed.sum())} of {len(passed)} consistency checks pass"
         failed = [str(name) for name in run.checks["name"][~passed.astype(bool)]]
         console.print(escape(words + (f"; failed: {', '.join(failed)}" if failed else "")), highlight=False)
-
-
-def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
-    """Print a quantity a row, and as many of its cells as there are names."""
-    table = Table(title=title)
-    table.add_column("quantity", no_wrap=True)
-    for name in names:
-        table.add_column(name, justify="right")
-    for row in rows:
-        table.add_row(*map(escape, row[: len(names) + 1]))
-    console.print(table)
 
 
 def value_rows(compared: RunComparison) -> list[list[str]]:
@@ -218,10 +206,8 @@ def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str
     if not (np.isfinite(high) and high > 0.0):
         return [f"{change:+.2f}", ""]
     shown = digits(high)
-    return [
-        f"{change:+.{shown}f}",
-        f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}",
-    ]
+    spread = f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}"
+    return [f"{change:+.{shown}f}", spread]
 
 
 # the page
@@ -234,7 +220,7 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
     spans = [run.tables["bet"]["t_s"] for run in compared.runs]
     whole = [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))]
     panels = [*_deflection_panels(compared), *_trajectory_panels(compared)]
-    data = charts(first, whole, pulse_window(bet), panels, _difference_panels(compared, over_time))
+    data = charts(first, whole, pulse_window(bet), panels, studies=_difference_panels(compared, over_time))
     return rendered(
         "compare.html",
         data,
@@ -269,10 +255,6 @@ def _value_names(compared: RunComparison) -> list[str]:
     return names
 
 
-def _look(number: int) -> tuple[str, list[int]]:
-    return MANY[number % len(MANY)], _DASHES[number % len(_DASHES)]
-
-
 def _overlay(compared: RunComparison, name: str, title: str, unit: str, drawn: list[Any]) -> list[Panel]:
     """One panel with a line a run: times, values and sds of each, None for a run without; none where no run has any."""
     lines = []
@@ -280,9 +262,8 @@ def _overlay(compared: RunComparison, name: str, title: str, unit: str, drawn: l
         if found is None or not np.isfinite(found[1]).any():
             continue
         t, values, sd = found
-        rows, (colour, dash) = kept_rows([values], _ROWS), _look(k)
-        thin_sd = None if sd is None else sd[rows]
-        one = line_of(compared.labels[k], values[rows], thin_sd, colour, dash, 4)
+        rows = kept_rows([values], 3000)
+        one = line_of(compared.labels[k], values[rows], None if sd is None else sd[rows], MANY[k], _DASHES[k], 4)
         lines.append(one | {"t": rounded(t[rows], 4)})
     return [panel_of(name, title, unit, None, lines, [])] if lines else []
 
@@ -291,20 +272,11 @@ def _deflection_panels(compared: RunComparison) -> list[Panel]:
     """One panel a method."""
     out = []
     for method in METHODS[::-1]:
-        drawn = [_answer(run, method) for run in compared.runs]
+        tables = [run.tables.get(answer_table(method, run.tables)) for run in compared.runs]
+        drawn = [None if table is None or not len(table) else drawn_answer(table) for table in tables]
         panels = _overlay(compared, f"by_{method}", f"Deflection, {LABEL[method]}", "deg", drawn)
         out += [panel | {"floor": 0} for panel in panels]
     return out
-
-
-def _answer(run: RunTables, method: str) -> Any:
-    table = run.tables.get(answer_table(method, run.tables))
-    if table is None or not len(table):
-        return None
-    t, (theta, sd) = with_holes(
-        table["t_s"].to_numpy(float), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
-    )
-    return t, theta, sd
 
 
 def _trajectory_panels(compared: RunComparison) -> list[Panel]:

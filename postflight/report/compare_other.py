@@ -8,24 +8,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.config import parse_utc
 from flightmodel.earth import require_earth
 from flightmodel.files import open_file
 from postflight.intake.other_trajectory import read_other
-from postflight.plots.style import COLOUR, PAGE
+from postflight.plots.style import COLOUR
 from postflight.report.panels import Panel, line_of, panel_of
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import date
-from postflight.report.write import pulse_window, rendered
+from postflight.report.write import charts, rendered
 from postflight.runs import RunTables, trajectory_of
 from postflight.systematic_differences import SystematicDifferences, digits, systematic_differences
 from postflight.terminal import terminal
 
 OTHER_TABLES = ("systematic_differences", "chi_square", "differences_over_time")
-_ROWS = 3000  # of a line that are drawn
 _TITLES = {"position": ("Position", "m"), "velocity": ("Velocity", "m/s"), "attitude": ("Rotation about body", "deg")}
 console = terminal()
 
@@ -69,40 +66,20 @@ def print_other(found: SystematicDifferences) -> None:
         console.print(escape(f"{found.label}: {note}"), highlight=False)
     names, rows = _effect_cells(found)
     if rows:
-        _print_table("Systematic differences, other minus run; ± is 1 sd", names, rows)
+        console.table("Systematic differences, other minus run; ± is 1 sd", names, rows)
     names, rows = _chi_square_cells(found)
-    _print_table("Chi-square per degree of freedom, mean over epochs", names, rows)
-
-
-def _print_table(title: str, names: list[str], rows: list[list[str]]) -> None:
-    table = Table(title=title)
-    for k, name in enumerate(names):
-        table.add_column(name, justify="right" if k else "left", no_wrap=not k)
-    for row in rows:
-        table.add_row(*map(escape, row))
-    console.print(table)
+    console.table("Chi-square per degree of freedom, mean over epochs", names, rows)
 
 
 def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[str]]]:
     names = ["effect", "component", "value", "sd", "allowed sd", "unit", "size in allowed sd", "beyond"]
-    rows = [
-        [
-            str(r.effect),
-            str(r.component),
-            f"{r.value:.{digits(r.sd)}f}",
-            f"{r.sd:.2g}",
-            _number(r.stated_sd),
-            str(r.unit),
-            f"{r.stated_size:.1f}" if np.isfinite(r.stated_size) else "",
-            "yes" if r.beyond else "no",
-        ]
-        for r in found.to_frame().itertuples()
-    ]
+    rows = []
+    for r in found.to_frame().itertuples():
+        allowed = f"{r.stated_sd:.2g}" if np.isfinite(r.stated_sd) else ""
+        size = f"{r.stated_size:.1f}" if np.isfinite(r.stated_size) else ""
+        numbers = [f"{r.value:.{digits(r.sd)}f}", f"{r.sd:.2g}", allowed, r.unit, size, "yes" if r.beyond else "no"]
+        rows.append([r.effect, r.component, *numbers])
     return names, rows
-
-
-def _number(value: float) -> str:
-    return f"{value:.2g}" if np.isfinite(value) else ""
 
 
 def _chi_square_cells(found: SystematicDifferences) -> tuple[list[str], list[list[str]]]:
@@ -112,7 +89,7 @@ def _chi_square_cells(found: SystematicDifferences) -> tuple[list[str], list[lis
 
 def _page(run: RunTables, found: SystematicDifferences, tables: dict[str, pd.DataFrame]) -> str:
     span = [float(found.time_s[0]), float(found.time_s[-1])]
-    data = charts(run, span, span, _panels(found, tables["differences_over_time"]), [])
+    data = charts(run, span, span, _panels(found, tables["differences_over_time"]))
     effects, chi_square = (
         {"names": names, "rows": rows, "more": 0} for names, rows in (_effect_cells(found), _chi_square_cells(found))
     )
@@ -126,27 +103,6 @@ def _page(run: RunTables, found: SystematicDifferences, tables: dict[str, pd.Dat
         title=title_of(found),
         date=date(run.header["epoch_utc"]),
     )
-
-
-def charts(
-    run: RunTables, span: list[float], first: list[float], panels: list[Panel], studies: list[Panel]
-) -> dict[str, Any]:
-    """What the page's scripts draw: whole time and the part shown first, events of a run, panels of two sections."""
-    return {
-        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
-        "span": span,
-        "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(run.tables["bet"]),
-        "first": first,
-        "peak": round(run.peak_s, 3),
-        "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
-        "panels": panels,
-        "rigid": [],
-        "studies": studies,
-        "residuals": [],
-        "solid": None,
-        "frames": [],
-    }
 
 
 def title_of(found: SystematicDifferences) -> str:
@@ -167,7 +123,7 @@ def _panels(found: SystematicDifferences, table: pd.DataFrame) -> list[Panel]:
         group, axis = str(column).split("_")[:2]
         stem, unit = f"{group}_{axis}", str(column).rpartition("_")[2]
         values, left, sd = (table[f"{stem}{what}_{unit}"].to_numpy(float) for what in ("", "_left", "_sd"))
-        rows = kept_rows([values, left], _ROWS)
+        rows = kept_rows([values, left], 3000)
         drawn: list[tuple[str, FloatArray, FloatArray | None, str, list[int]]] = [
             ("both covariances" if found.both_stated else "run's covariance", 0.0 * sd, sd, COLOUR["prior"], [2, 3]),
             ("as given", values, None, COLOUR["second"], [8, 4]),

@@ -17,19 +17,20 @@ import pandas as pd
 from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
-from flightmodel.statistics import chi_square_quantile, inside
+from flightmodel.statistics import BAND_COLUMNS, chi_square_quantile, inside
+from flightmodel.tables import column_about
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
 from postflight.report.source import Rows, Run, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
 from recon.measurements import component_unit
 
-_TRAJECTORY_ROWS, _RAW_POINTS, _TRACK_POINTS, _RESIDUAL_POINTS = 6000, 8000, 6000, 16000
-_BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
-_DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
+_TRAJECTORY_ROWS, _RAW_POINTS = 6000, 8000
 _NO_ACCELEROMETER = "The flight has no accelerometer."
 _NO_GYROS = "Its accelerometer serves as a deceleration along the path; without gyros no force has known axes."
 _NO_ATTITUDE = "No inertial sensors carried the attitude, so the angle of attack is not known."
+_BLUE, _GREY, _DARK = COLOUR["estimate"], COLOUR["prior"], COLOUR["limit"]
+_DASH: dict[str, list[int]] = {"camera": [], "misalignment": [8, 4], "trim": [10, 3, 2, 3], "fused": []}
 NO_DEFLECTION = "No method gave a deflection; the reasons stand on the cards above."
 
 Panel = dict[str, Any]
@@ -120,7 +121,7 @@ def _tracker_heights(run: Run) -> list[dict[str, Any]]:
     tracks += [(name, r.time_s, r.position_ecef_m) for name, r in run.telemetry.gnss.items() if r.has_positions]
     known = [(name, t, earth.geodetic_from_ecef(places, planet)[2]) for name, t, places in tracks]
     known += [(name, b.time_s, b.height_m) for name, b in run.telemetry.barometers.items()]
-    return [_points(name, t, h / 1e3, _GREY, 4, _TRACK_POINTS // len(known)) for name, t, h in known]
+    return [_points(name, t, h / 1e3, _GREY, 4, 6000 // len(known)) for name, t, h in known]
 
 
 def _raw_accelerations(run: Run) -> dict[str, list[dict[str, Any]]]:
@@ -141,13 +142,8 @@ def _points(label: str, time_s: FloatArray, values: FloatArray, colour: str, dec
     known = np.isfinite(values)
     time_s, values = time_s[known], values[known]
     rows = kept_rows([values], limit) if len(values) else np.empty(0, dtype=int)
-    return {
-        "label": label,
-        "t": rounded(time_s[rows], 4),
-        "y": rounded(values[rows], decimals),
-        "colour": colour,
-        "of": len(values),
-    }
+    t, y = rounded(time_s[rows], 4), rounded(values[rows], decimals)
+    return {"label": label, "t": t, "y": y, "colour": colour, "of": len(values)}
 
 
 def deflection_panel(run: Run) -> Panel | None:
@@ -164,9 +160,7 @@ def deflection_panel(run: Run) -> Panel | None:
         if table is not frames:
             t, theta = (frames[c].to_numpy(float) for c in ("t_s", "theta_deg"))
             dots.append(_points("frames", t, theta, COLOUR[method], 4, _RAW_POINTS))
-        t, (theta, sd) = with_holes(
-            table["t_s"].to_numpy(), [table[c].to_numpy(float) for c in ("theta_deg", "theta_sd_deg")]
-        )
+        t, theta, sd = drawn_answer(table)
         rows = kept_rows([theta], _TRAJECTORY_ROWS // 2)
         one = line_of(LABEL[method], theta[rows], sd[rows], COLOUR[method], _DASH[method], 4)
         # frames are few: each is a dot, which also sets the line apart without colours
@@ -176,6 +170,13 @@ def deflection_panel(run: Run) -> Panel | None:
         return None
     out = panel_of("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
+
+
+def drawn_answer(table: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, angles and their sd, (n,) s and deg, of a table of answers; NaN in its holes."""
+    columns = [table[name].to_numpy(float) for name in ("theta_deg", "theta_sd_deg")]
+    t, (theta, sd) = with_holes(table["t_s"].to_numpy(float), columns)
+    return t, theta, sd
 
 
 def residual_panels(run: Run) -> list[Panel]:
@@ -192,7 +193,7 @@ def residual_panels(run: Run) -> list[Panel]:
         scale, unit = drawn_unit(str(rows["unit"].iloc[0]) if "unit" in rows else component_unit(component))
         r, sd = (scale * rows[c].to_numpy(float) for c in ("residual", "predicted_sd"))
         good = rows["accepted"].to_numpy(bool)
-        kept = kept_rows([r, np.where(good, np.nan, r)], _RESIDUAL_POINTS // len(pairs))
+        kept = kept_rows([r, np.where(good, np.nan, r)], 16000 // len(pairs))
         gate = float(np.sqrt(chi_square_quantile(chance, int(rows["together"].max()))))
         out.append(
             {"id": f"residual_{len(out)}", "title": f"{source}: {component}", "unit": unit, "gate": round(gate, 3),
@@ -204,7 +205,7 @@ def residual_panels(run: Run) -> list[Panel]:
 
 
 _FILE = "bands.csv"
-_LOW, _MIDDLE, _HIGH = "p2.3", "p50", "p97.7"
+_LOW, _MIDDLE, _HIGH = BAND_COLUMNS
 _COLOURS = (_GREY, COLOUR["second"], COLOUR["corrected"], _DARK)
 # quantity of a band: title, unit, and the flight's own from bet.csv
 _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
@@ -214,11 +215,7 @@ _FLOWN: dict[str, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         "g",
         lambda bet: np.hypot(bet["ay_cg_mps2"], bet["az_cg_mps2"]) / earth.STANDARD_GRAVITY_MPS2,
     ),
-    "axial_g": (
-        "Axial deceleration at the c.g.",
-        "g",
-        lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2,
-    ),
+    "axial_g": ("Axial deceleration at the c.g.", "g", lambda bet: -bet["ax_cg_mps2"] / earth.STANDARD_GRAVITY_MPS2),
     "rate_degps": ("Lateral rate", "deg/s", lambda bet: np.hypot(bet["q_body_degps"], bet["r_body_degps"])),
     "dynamic_pressure_pa": ("Dynamic pressure", "Pa", lambda bet: bet["dynamic_pressure_pa"]),
     "mach": ("Mach number", "", lambda bet: bet["mach"]),
@@ -232,10 +229,10 @@ def rigid_panels(run: Run) -> list[Panel]:
     if bounds is None:
         return []
     parts = []
-    for quantity, unit in (("alpha_total", "deg"), ("normal", "g")):
-        columns = {_LOW: "low", _MIDDLE: "median", _HIGH: "high", "nominal": "nominal"}
-        part = {new: bounds[f"{quantity}_{old}_{unit}"] for new, old in columns.items()}
-        parts.append(pd.DataFrame({"quantity": f"{quantity}_{unit}", "time_s": bounds["t_s"], **part}))
+    columns = {_LOW: "low", _MIDDLE: "median", _HIGH: "high", "nominal": "nominal"}
+    for quantity in ("alpha_total_deg", "normal_g"):
+        part = {new: bounds[column_about(quantity, old)] for new, old in columns.items()}
+        parts.append(pd.DataFrame({"quantity": quantity, "time_s": bounds["t_s"], **part}))
     return _band_panels(run, pd.concat(parts).assign(label="rigid"), "rigid")
 
 
@@ -260,12 +257,12 @@ def _read_bands(path: Path) -> pd.DataFrame:
         numbers = table[["time_s", _LOW, _MIDDLE, _HIGH]].astype(float)
     except FileNotFoundError:
         where = "`postflight montecarlo run` and `postflight reconcile` write them"
-        raise GateError(f"{path}: no bands ({_FILE}) here; {where}", "bands-missing") from None
+        raise GateError(f"{path}: no bands ({_FILE}) here; {where}", "file-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{file}: no table of bands: {fault}", "bands-unreadable") from None
+        raise GateError(f"{file}: no table of bands: {fault}", "file-unreadable") from None
     if "quantity" not in table or not len(table):
         words = "name histories in the dispersions file's [outputs] and merge the study again"
-        raise GateError(f"{file}: holds no band of any quantity; {words}", "bands-empty")
+        raise GateError(f"{file}: holds no band of any quantity; {words}", "too-few-data")
     label = table["label"].astype(str) if "label" in table else path.resolve().name
     nominal = table["nominal"].astype(float) if "nominal" in table else np.nan
     return numbers.assign(label=label, quantity=table["quantity"].astype(str), nominal=nominal)
@@ -307,7 +304,7 @@ def _band_panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
         raise GateError(
             f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: none of a "
             f"quantity ({', '.join([*_FLOWN, 'deflection_deg'])}) and time of this flight's pulse",
-            "bands-of-another-flight",
+            "time-not-covered",
         )
     return out
 
@@ -327,12 +324,8 @@ def _band_lines(label: str, band: pd.DataFrame, share: float, colour: str) -> li
     t = rounded(band["time_s"].to_numpy(), 3)
     low, middle, high = (rounded(band[c].to_numpy(), 4) for c in (_LOW, _MIDDLE, _HIGH))
     words = f"{label}, median; {100 * share:.0f} % of the pulse inside"
-    lines = [
-        {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
-    ]
-    if band["nominal"].notna().any():
-        nominal = rounded(band["nominal"].to_numpy(), 4)
-        lines.append(
-            {"label": f"{label}, nominal", "t": t, "y": nominal, "colour": _DARK, "dash": [2, 3], "width": 1.2}
-        )
-    return lines
+    one = {"label": words, "t": t, "y": middle, "low": low, "high": high, "colour": colour, "dash": [], "width": 1.2}
+    if not band["nominal"].notna().any():
+        return [one]
+    y = rounded(band["nominal"].to_numpy(), 4)
+    return [one, {"label": f"{label}, nominal", "t": t, "y": y, "colour": _DARK, "dash": [2, 3], "width": 1.2}]

@@ -20,9 +20,7 @@ from postflight.filming import by_camera
 from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.report.source import Run
 
-_FRAMES, _WIDTH_PX, _DASH_PX = 12, 480, 12
-_LEAST_FRAMES = 4
-_WORST, _LEAST_NEIGHBOURS = 5, 2
+_WIDTH_PX, _WORST = 480, 5
 QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality
 
 
@@ -39,7 +37,7 @@ def film_strip(run: Run) -> list[dict[str, Any]]:
     strips = []
     for name, (seen, own) in by_camera(run.telemetry, history).items():
         near = np.isin(np.round(table["t_s"], 3), np.round(own.time_s[np.isfinite(own.theta_rad)], 3))
-        strips += _strip(name, seen, table[near], max(_FRAMES // len(films), _LEAST_FRAMES))
+        strips += _strip(name, seen, table[near], max(12 // len(films), 4))
     strips.sort(key=lambda one: one[0]["t"])
     texts = jpegs([picture for _, picture in strips])
     return [frame | {"jpeg": text} for (frame, _), text in zip(strips, texts, strict=True)]
@@ -136,7 +134,7 @@ def worst_first(table: pd.DataFrame) -> list[int]:
 def _sizes(used: pd.DataFrame) -> pd.Series:
     """Size of each used frame's residual or step, of one camera."""
     size = used["residual_rms_px"] / max(used["residual_rms_px"].median(), 1e-9)
-    if len(used) > _LEAST_NEIGHBOURS:
+    if len(used) > 2:
         yz = lv_direction(np.deg2rad(used["plane_lv_deg"].to_numpy()))[:, 1:] * used["theta_deg"].to_numpy()[:, None]
         t = used["t_s"].to_numpy()
         share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
@@ -152,7 +150,7 @@ def _dashed_row(picture: Image, row: int) -> Image:
     """Picture with the grey line in dashes, so that it stands apart from the yellow one without colours."""
     drawn = picture.copy()
     draw_row(drawn, row, GREY)
-    dash = (np.arange(picture.shape[1]) // _DASH_PX % 2 == 0)[None, :, None]
+    dash = (np.arange(picture.shape[1]) // 12 % 2 == 0)[None, :, None]
     return np.where(dash, drawn, picture)
 
 

@@ -33,7 +33,7 @@ _BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "tri
 _ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
-_NEAR_PEAK_S, _OSCILLATES_SD = 1.0, 4.0  # window about the peak; range in it that one number does not describe
+_NEAR_PEAK_S = 1.0  # window about the peak
 
 
 def date(utc: str) -> str:
@@ -132,7 +132,8 @@ def _oscillation(run: Run) -> str:
             f"about it, {first:.2f} to {last:.2f} s, the largest at {answer['largest_at_s']:.2f} s."
         )
     near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
-    if len(near) < 2 or near.max() - near.min() < _OSCILLATES_SD * answer["sd_deg"]:
+    # a range that one number describes
+    if len(near) < 2 or near.max() - near.min() < 4.0 * answer["sd_deg"]:
         return ""
     return (
         f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "
@@ -142,9 +143,8 @@ def _oscillation(run: Run) -> str:
 
 def _outside_its_inputs(run: Run) -> str:
     """Sentence on a fused angle beyond those of all methods, and why; empty where it lies among them."""
-    answers = {
-        name: m["deflection_deg"] for name, m in run.summary["methods"].items() if m["deflection_deg"] is not None
-    }
+    methods = run.summary["methods"]
+    answers = {name: angle for name, m in methods.items() if (angle := m["deflection_deg"]) is not None}
     fused = answers.pop("fused", None)
     if fused is None or len(answers) < 2 or min(answers.values()) <= fused <= max(answers.values()):
         return ""
@@ -227,18 +227,14 @@ def plane_at(run: Run, method: str) -> str:
     return f"{float(clock):.{places}f} ± {sd:.{places}f}"
 
 
-def _scale(shown: list[dict[str, Any]]) -> tuple[float, float]:
-    """Common scale of the cards' whiskers, deg: all intervals of 5 to 95 % with a margin."""
-    ends = [end for c in shown if "number" in c for end in (*c["quantiles"], c["number"])]
-    if not ends:
-        return 0.0, 1.0
-    margin = 0.06 * (max(ends) - min(ends)) + 0.01
-    return min(ends) - margin, max(ends) + margin
-
-
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 5 to 95 % as a band behind each."""
-    least, most = _scale(shown)
+    """Cards with the places of their whiskers on a scale of 0 to 200; the fusion's 5 to 95 % as a band behind each.
+
+    The scale, deg, is common: all intervals of 5 to 95 % with a margin.
+    """
+    ends = [end for c in shown if "number" in c for end in (*c["quantiles"], c["number"])] or [0.0, 1.0]
+    margin = 0.06 * (max(ends) - min(ends)) + 0.01
+    least, most = min(ends) - margin, max(ends) + margin
     place = lambda x: round(200.0 * (x - least) / (most - least), 1)  # noqa: E731
     fused = next((c for c in shown if c["method"] == "fused" and "number" in c), None)
     for c in shown:

@@ -17,7 +17,7 @@ from flightmodel.vehicle import Vehicle
 from postflight.report.source import Rows, Run, rounded
 from postflight.run_folder import answer_table
 
-_LEAST_SECTIONS, _POINTS_PER_TORUS, _CONE_PIECES, _POSES = 48, 7, 8, 3000
+_CONE_PIECES, _POSES = 8, 3000
 
 
 def solid(vehicle: Vehicle) -> dict[str, Any]:
@@ -26,18 +26,18 @@ def solid(vehicle: Vehicle) -> dict[str, Any]:
     Seen from outside, a quadrangle's vertices go round against the clock.
     """
     geometry = vehicle.geometry
-    per_gore = max(1, -(-_LEAST_SECTIONS // geometry.gore_count))
+    per_gore = max(1, -(-48 // geometry.gore_count))  # 48 sections or more in all
     sections = per_gore * geometry.gore_count
-    aft = aft_profile(geometry, _POINTS_PER_TORUS)
+    aft = aft_profile(geometry, 7)
     forward = forward_profile(geometry)
     forward = np.concatenate([forward[:-1], np.linspace(forward[-2], forward[-1], _CONE_PIECES + 1)[1:]])
     # the centerbody shows where it comes out of the shell; it ends in a lid
     stations = np.linspace(aft[0, 0], geometry.centerbody_length_m, _CONE_PIECES)
     body = np.column_stack([stations, np.full(_CONE_PIECES, geometry.centerbody_radius_m)])
     body = np.concatenate([body, [[geometry.centerbody_length_m, 0.0]]])
+    gores = np.repeat(np.arange(sections) // per_gore, len(aft) - 1).tolist()
     return {
-        "aft": _surface(aft[::-1], sections)
-        | {"gores": np.repeat(np.arange(sections) // per_gore, len(aft) - 1).tolist()},
+        "aft": _surface(aft[::-1], sections) | {"gores": gores},
         "forward": _surface(forward, sections),
         "centerbody": _surface(body, sections),
         "rim": _mm(rim_curve(geometry, np.linspace(0.0, 2.0 * np.pi, 73))),
@@ -69,9 +69,8 @@ def poses(run: Run, rows: Rows) -> dict[str, Any]:
     bet = run.tables["bet"].iloc[rows]
     known = bet["alpha_total_wind_deg"].notna()
     thin = _thinned(bet[known])
-    out: dict[str, Any] = {
-        "flow": {"t": rounded(thin["t_s"].to_numpy(), 3)} | _lateral(thin["alpha_total_wind_deg"], thin["clock_lv_deg"])
-    }
+    flow = _lateral(thin["alpha_total_wind_deg"], thin["clock_lv_deg"])
+    out: dict[str, Any] = {"flow": {"t": rounded(thin["t_s"].to_numpy(), 3)} | flow}
     method = best_method(run)
     if method is not None:
         table = _thinned(run.tables[answer_table(method, run.tables)])

@@ -29,6 +29,7 @@ from postflight.plots.style import COLOUR, PAGE
 from postflight.report import text, view_3d
 from postflight.report.panels import (
     NO_DEFLECTION,
+    Panel,
     deflection_panel,
     residual_panels,
     rigid_panels,
@@ -37,6 +38,7 @@ from postflight.report.panels import (
     trajectory_rows,
 )
 from postflight.report.source import Run, read_run, rounded
+from postflight.runs import RunTables
 
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -44,8 +46,6 @@ STYLES = ("uPlot.min.css", "page.css")
 SHARED = ("head.html", "parts.html", "foot.html")  # what the pages share: how they begin and end, and macros
 # what a script element must not hold literally: its own end, a comment's start, and line ends of JavaScript alone
 _ESCAPED = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
-_LEAST_POINTS = 30  # of residuals: the noise to an eighth
-_DEG = "deg"
 # kind of tracker in flight.toml: its keys, each from which components, and the stated size in that key's unit
 _Stated = Callable[[dict[str, Any]], float | None]
 _KEYS: dict[str, tuple[tuple[str, tuple[str, ...], _Stated], ...]] = {
@@ -189,25 +189,41 @@ def _numbers(
         absent.insert(0, ("deflection", "Deflection", NO_DEFLECTION))
     vehicle = run.telemetry.vehicle
     span = [float(bet["t_s"].iloc[0]), float(bet["t_s"].iloc[-1])]
+    data = charts(
+        run,
+        span,
+        span if deflection is None else pulse_window(bet),
+        panels,
+        bet=rounded(bet["t_s"].to_numpy()[rows], 4),
+        rows=[len(rows), len(bet)],
+        rigid=rigid_panels(run),
+        studies=study_panels(run, studies),
+        residuals=residual_panels(run),
+        solid=None if vehicle is None else view_3d.solid(vehicle),
+        poses=view_3d.poses(run, rows),
+        frames=[{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
+    )
+    return data, absent
+
+
+def charts(run: RunTables, span: list[float], first: list[float], panels: list[Panel], **more: Any) -> dict[str, Any]:
+    """What a page's scripts draw: whole time and the part shown first, events of a run, panels, and ``more``.
+
+    Only the report itself has columns of the trajectory (``bet``, ``rows``) and ``poses``.
+    """
     data = {
-        "t0_ms": round(1e3 * parse_utc(run.telemetry.t0_utc).timestamp()),
+        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
         "span": span,
         "colours": PAGE | {"residual": COLOUR["estimate"]},
-        "pulse": pulse_window(bet),
-        "first": span if deflection is None else pulse_window(bet),
-        "peak": round(float(run.summary["peak_dynamic_pressure_s"]), 3),
-        "bet": rounded(bet["t_s"].to_numpy()[rows], 4),
-        "rows": [len(rows), len(bet)],
+        "pulse": pulse_window(run.tables["bet"]),
+        "first": first,
+        "peak": round(run.peak_s, 3),
+        "bet": None, "rows": None,
         "events": [{"t": round(float(e.t_s), 3), "name": str(e.event)} for e in run.tables["events"].itertuples()],
         "panels": panels,
-        "rigid": rigid_panels(run),
-        "studies": study_panels(run, studies),
-        "residuals": residual_panels(run),
-        "solid": None if vehicle is None else view_3d.solid(vehicle),
-        "poses": view_3d.poses(run, rows),
-        "frames": [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames],
-    }
-    return data, absent
+        "rigid": [], "studies": [], "residuals": [], "solid": None, "poses": None, "frames": [],
+    } | more  # fmt: skip
+    return {key: value for key, value in data.items() if key in more or key not in ("bet", "rows", "poses")}
 
 
 def pulse_window(bet: pd.DataFrame) -> list[float]:
@@ -215,10 +231,8 @@ def pulse_window(bet: pd.DataFrame) -> list[float]:
     t = bet["t_s"].to_numpy()
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
     width = inside[-1] - inside[0]
-    return [
-        round(float(max(inside[0] - 0.75 * width, t[0])), 3),
-        round(float(min(inside[-1] + 0.5 * width, t[-1])), 3),
-    ]
+    first, last = max(inside[0] - 0.75 * width, t[0]), min(inside[-1] + 0.5 * width, t[-1])
+    return [round(float(first), 3), round(float(last), 3)]
 
 
 def safe_json(value: Any) -> str:
@@ -265,7 +279,8 @@ def _noise(run: Run, group: str, name: str) -> list[str]:
     stated = next((s for s in run.header["sensors"] if s.get("name") == name), None)
     if residuals is None or stated is None:
         return []
-    mine = residuals[(residuals["source"] == name) & (residuals["count"] - residuals["edited"] >= _LEAST_POINTS)]
+    # the noise is found to an eighth from so many residuals
+    mine = residuals[(residuals["source"] == name) & (residuals["count"] - residuals["edited"] >= 30)]
     out = []
     for key, components, size in _KEYS[group]:
         times = mine.loc[mine["component"].isin(components), "rms_normalised"].to_numpy(float)
@@ -287,7 +302,7 @@ def _estimated(run: Run, name: str) -> list[str]:
         if error == row.name or "bias" not in error or pd.isna(row.estimate) or row.treated != "estimated":
             continue
         angle = str(row.unit).startswith("rad")
-        scale, unit = (180.0 / np.pi, str(row.unit).replace("rad", _DEG)) if angle else (1.0, str(row.unit))
+        scale, unit = (180.0 / np.pi, str(row.unit).replace("rad", "deg")) if angle else (1.0, str(row.unit))
         value, sd, prior = (scale * float(x) for x in (row.estimate, row.sd, row.prior_sd))
         out.append(f"# {error}: {value:+.3g} +/- {sd:.3g} {unit} in this flight; a priori sd {prior:.3g}")
     return out

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from rich.markup import escape
-from rich.table import Table
 
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import GateError
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
-from flightmodel.statistics import inside
+from flightmodel.statistics import BAND_COLUMNS, inside
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
@@ -41,65 +40,52 @@ def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "table_3_1.csv", table)
     draw(folder / "table_3_1.png", studies.figure_table_3_1, table, f"vehicle: {known.name}")
-    printed = Table(title="Table 3.1 (AIAA 2011-2571)")
-    for name in ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own"):
-        printed.add_column(name, justify="left" if name in ("study", "quantity") else "right")
-    for r in table.itertuples():
-        numbers = f"{r.frequency_hz:g}", f"{r.damping_percent:g}"
-        printed.add_row(r.study, *numbers, r.quantity, r.paper, r.ours, f"{r.vehicle:.5g}")
-    console.print(printed)
+    names = ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own")
+    rows = [
+        (r.study, f"{r.frequency_hz:g}", f"{r.damping_percent:g}", r.quantity, r.paper, r.ours, f"{r.vehicle:.5g}")
+        for r in table.itertuples()
+    ]
+    console.table("Table 3.1 (AIAA 2011-2571)", names, rows, words=("quantity",))
     console.print(f"{int(table['agrees'].sum())} of {len(table)} numbers agree to the last digit printed")
     console.print(f"results in {escape(str(folder))}")
 
 
-def damping(scenario: str, folder: Path, seed: int) -> None:
-    """Write and print the damping study."""
+_ALPHA, _NORMAL = "centerbody total angle of attack (deg)", "centerbody normal acceleration (g)"
+# study: what flies it, title of its figures, and their number, quantity and label
+_JOINT_STUDIES = {
+    "damping": (
+        joints.damping_study, "Damping of the joint at 2.5 Hz, % of critical", (("3.1", "alpha_total_deg", _ALPHA),),
+    ),
+    "stiffness": (
+        joints.stiffness_study, "Stiffness of the joint at 0.5 % of critical",
+        (("3.2", "alpha_total_deg", _ALPHA), ("3.3", "normal_g", _NORMAL)),
+    ),
+}  # fmt: skip
+
+
+def joint_study(name: str, scenario: str, folder: Path, seed: int) -> None:
+    """Fly the study of the joint's ``damping`` or ``stiffness``; write it, and print it beside the paper's words."""
     chosen = read_scenario(scenario)
     compile_kernels("simulator", "ensembles")
-    study = joints.damping_study(chosen, seed)
-    title = "Damping of the joint at 2.5 Hz, % of critical (AIAA 2011-2571, Figure 3.1)"
-    label = "centerbody total angle of attack (deg)"
-    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
-    picture = partial(studies.figure_joints, study, "alpha_total_deg", label, title, synthetic)
-    write_study(study, folder, "damping", {"figure_3_1.png": picture})
-
-
-def stiffness(scenario: str, folder: Path, seed: int) -> None:
-    """Write and print the stiffness study."""
-    chosen = read_scenario(scenario)
-    compile_kernels("simulator", "ensembles")
-    study = joints.stiffness_study(chosen, seed)
-    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
-    title = "Stiffness of the joint at 0.5 % of critical (AIAA 2011-2571"
-    pictures = {
-        name: partial(studies.figure_joints, study, quantity, label, f"{title}, {number})", synthetic)
-        for name, quantity, label, number in (
-            ("figure_3_2.png", "alpha_total_deg", "centerbody total angle of attack (deg)", "Figure 3.2"),
-            ("figure_3_3.png", "normal_g", "centerbody normal acceleration (g)", "Figure 3.3"),
-        )
-    }
-    write_study(study, folder, "stiffness", pictures)
-
-
-def write_study(
-    study: joints.JointStudy, folder: Path, name: str, pictures: Mapping[str, Callable[[], studies.Figure]]
-) -> None:
-    """Write tables and figures of a study of the joint, and print it beside the paper's statements."""
+    fly, title, figures = _JOINT_STUDIES[name]
+    study = fly(chosen, seed)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
     write_csv(folder / f"{name}_paper.csv", study.paper)
     write_csv(folder / f"{name}_histories.csv", joints.histories(study))
-    for file, figure in pictures.items():
-        draw(folder / file, figure)
+    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
+    for number, quantity, label in figures:
+        words = f"{title} (AIAA 2011-2571, Figure {number})"
+        path = folder / f"figure_{number.replace('.', '_')}.png"
+        draw(path, studies.figure_joints, study, quantity, label, words, synthetic)
     later = f"{joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
-    table = Table(title=f"Centerbody around peak pressure ({study.peak_s:.1f} s) and {later}")
-    for head in ("joint", "alpha deg", "later", "normal g", "peak g", "deflection deg", "tumbled s"):
-        table.add_column(head, justify="left" if head == "joint" else "right")
+    rows = []
     for r in study.table.itertuples():
         cells = (r.alpha_mean_deg, r.alpha_later_mean_deg, r.normal_mean_g, r.normal_peak_g, r.deflection_mean_deg)
         ended = "" if np.isnan(r.tumbled_s) else f"{r.tumbled_s:.1f}"
-        table.add_row(r.joint, *("" if np.isnan(x) else f"{x:.2f}" for x in cells), ended)
-    console.print(table)
+        rows.append((r.joint, *("" if np.isnan(x) else f"{x:.2f}" for x in cells), ended))
+    names = ("joint", "alpha deg", "later", "normal g", "peak g", "deflection deg", "tumbled s")
+    console.table(f"Centerbody around peak pressure ({study.peak_s:.1f} s) and {later}", names, rows)
     for r in study.paper.itertuples():
         mark = "[green]agrees[/]" if r.agrees else "[yellow]differs[/]"
         console.print(f"{mark} {escape(r.claim)}: paper {r.paper}, here {r.ours:.2f} ({escape(r.measured_as)})")
@@ -117,15 +103,14 @@ def shell_test(
     write_csv(folder / "shell_test.csv", laws)
     (folder / "joint.toml").write_text(found.selected.vehicle_file_lines())
     draw(folder / "shell_test.png", studies.figure_shell_test, found, f"load test {test.name}")
-    printed = Table(title=f"Laws of the joint by the load test {escape(test.name)}")
-    for head in ("law", "rms, % of the largest", "largest", "creep share", "time constant s", ""):
-        printed.add_column(head, justify="left" if head in ("law", "") else "right")
+    rows = []
     for fit, r in zip(found.fits, laws.to_dict(orient="records"), strict=True):
         creep = [f"{r[name]:.3g} +/- {r[f'{name}_sd']:.1g}" if "creep" in fit.laws else ""
                  for name in ("creep_share", "creep_time_s")]  # fmt: skip
         remark = "selected" if r["selected"] else "" if fit.time_is_inside else "time constant not inside the test"
-        printed.add_row(r["law"], f"{r['rms_percent']:.2f}", f"{r['largest_percent']:.1f}", *creep, remark)
-    console.print(printed)
+        rows.append((r["law"], f"{r['rms_percent']:.2f}", f"{r['largest_percent']:.1f}", *creep, remark))
+    names = ("law", "rms, % of the largest", "largest", "creep share", "time constant s", "")
+    console.table(f"Laws of the joint by the load test {test.name}", names, rows, words=("",))
     console.print(escape(found.selected.vehicle_file_lines()), end="")
     console.print(f"results in {escape(str(folder))}")
 
@@ -145,14 +130,14 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
     write_csv(folder / "preflight_flight.csv", flown)
     draw(folder / "figure_1_3.png", picture)
-    printed = Table(title=f"The flight against 2.3 to 97.7 % of {flights} entries, over the pulse")
-    for head in ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged"):
-        left = head in ("joint", "quantity")
-        printed.add_column(head, justify="left" if left else "right", no_wrap=left)
-    for r in table.itertuples():
-        numbers = f"{100 * r.share_inside:.1f} %", f"{r.over_median_at_peak:.3g}", f"{r.peak_over_upper:.2f}"
-        printed.add_row(r.joint, r.quantity, *numbers, f"{r.diverged}")
-    console.print(printed)
+    names = ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged")
+    rows = [
+        (r.joint, r.quantity, f"{100 * r.share_inside:.1f} %", f"{r.over_median_at_peak:.3g}",
+         f"{r.peak_over_upper:.2f}", r.diverged)
+        for r in table.itertuples()
+    ]  # fmt: skip
+    title = f"The flight against 2.3 to 97.7 % of {flights} entries, over the pulse"
+    console.table(title, names, rows, words=("quantity",))
     console.print("paper: angle of attack 4 to 5 deg above the median, peak normal acceleration over twice the bound")
     console.print(f"results in {escape(str(folder))}")
 
@@ -162,21 +147,17 @@ def compared_with_bounds(
 ) -> tuple[pd.DataFrame, pd.DataFrame, Drawing]:
     """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and what draws both."""
     pulse = flight.required_loads()
-    flown = pd.DataFrame(
-        {
-            "time_s": pulse.time_s,
-            "alpha_total_deg": np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad)),
-            "normal_g": np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2,
-        }
-    )
+    alpha_deg = np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad))
+    normal_g = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
+    flown = pd.DataFrame({"time_s": pulse.time_s, "alpha_total_deg": alpha_deg, "normal_g": normal_g})
     table = shares(flight, flown, rigid, flexible)
     remark = "inside, of the pulse: " + "; ".join(
         f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
         for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
     )
     tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
-    span = _pulse_span(flight)
-    window = span[0] - 10.0, span[1] + 5.0
+    first_s, last_s = _pulse_span(flight)
+    window = first_s - 10.0, last_s + 5.0
     title = f"{flight.telemetry.name}: {tag}"
     return table, flown, partial(studies.figure_preflight, rigid, flexible, flown, window, remark, title)
 
@@ -192,13 +173,12 @@ def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible:
     Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where
     the flight has its peak, ``over_median_at_peak`` and ``peak_over_upper`` (a ratio); ``diverged`` flights.
     """
-    first, last = _pulse_span(flight)
-    rows = flown[(flown["time_s"] >= first) & (flown["time_s"] <= last)]
+    rows = flown[flown["time_s"].between(*_pulse_span(flight))]
     if rows.empty:
-        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="pulse-missing")
+        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="time-not-covered")
     time_s, out = rows["time_s"].to_numpy(), []
     for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
-        for quantity, band in (("alpha_total_deg", bounds.alpha_total_deg), ("normal_g", bounds.normal_g)):
+        for quantity, (band, _) in bounds.by_quantity.items():
             values = rows[quantity].to_numpy()
             at = int(np.argmax(values))
             middle, upper = (np.interp(time_s, bounds.time_s, band[k]) for k in (1, 2))
@@ -218,22 +198,10 @@ def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible:
 
 def bands(rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
     """Bands of both, for a file."""
-    parts = [
-        pd.DataFrame(
-            {
-                "joint": joint,
-                "quantity": quantity,
-                "time_s": np.round(b.time_s, 6),
-                "p2.3": band[0],
-                "p50": band[1],
-                "p97.7": band[2],
-                "nominal": nominal,
-            }
-        )
-        for joint, b in (("rigid", rigid), ("flexible", flexible))
-        for quantity, band, nominal in (
-            ("alpha_total_deg", b.alpha_total_deg, b.nominal_alpha_deg),
-            ("normal_g", b.normal_g, b.nominal_normal_g),
-        )
-    ]
+    parts = []
+    for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
+        for quantity, (band, nominal) in bounds.by_quantity.items():
+            about = {"joint": joint, "quantity": quantity, "time_s": np.round(bounds.time_s, 6)}
+            percentiles = dict(zip(BAND_COLUMNS, band, strict=True))
+            parts.append(pd.DataFrame(about | percentiles | {"nominal": nominal}))
     return pd.concat(parts, ignore_index=True)

@@ -27,6 +27,7 @@ from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.statistics import percentile_band
+from flightmodel.tables import column_about
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
 from postflight.deflections import fused_history
@@ -56,7 +57,7 @@ RECORD_S, SPAN_S = 0.05, 70.0
 AIR_ROWS = int((START_ALTITUDE_M + 30e3 - simulate.ATMOSPHERE_START_M) / simulate.ATMOSPHERE_STEP_M) + 1
 # steps of a slow vehicle; of a faster one so many that it turns by `STEP_RAD` in each: fourth-order steps then err by
 # 1e-6 rad
-RIGID_STEP_S, FLEXIBLE_STEP_S, STEP_RAD = RECORD_S / 3.0, 0.005, 0.15
+STEP_RAD = 0.15
 ENTRIES = 300
 
 
@@ -76,44 +77,41 @@ class Bounds:
     flights: int
     ended: int = 0
 
+    @property
+    def by_quantity(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Bands ``(3, n)`` and nominal history ``(n,)`` of each quantity."""
+        return {
+            "alpha_total_deg": (self.alpha_total_deg, self.nominal_alpha_deg),
+            "normal_g": (self.normal_g, self.nominal_normal_g),
+        }
+
     def table(self) -> pd.DataFrame:
         """Return the bands as columns, for ``rigid_bounds.csv``."""
         columns: dict[str, FloatArray] = {"t_s": self.time_s}
-        for name, unit, bands, nominal in (
-            ("alpha_total", "deg", self.alpha_total_deg, self.nominal_alpha_deg),
-            ("normal", "g", self.normal_g, self.nominal_normal_g),
-        ):
-            columns |= {f"{name}_{part}_{unit}": c for part, c in zip(("low", "median", "high"), bands, strict=True)}
-            columns[f"{name}_nominal_{unit}"] = nominal
+        for quantity, (bands, nominal) in self.by_quantity.items():
+            for part, values in zip(("low", "median", "high", "nominal"), (*bands, nominal), strict=True):
+                columns[column_about(quantity, part)] = values
         return pd.DataFrame(columns).assign(flights=self.flights)
 
 
 def dispersions_of(stated: Uncertainty, joint: JointDispersions | None) -> Dispersions:
     """Dispersions that a vehicle file states; with a flexible joint where those of the joint are given."""
 
-    def normal(sd: float) -> Factor:
-        return Factor(normal=sd)
-
-    def shift(sd: float) -> Shift:
-        return Shift(normal=sd)
-
+    mass, inertia = Factor(normal=stated.mass), Factor(normal=stated.inertia)
+    station, lateral = Shift(normal=stated.cg_station_m), Shift(normal=stated.cg_lateral_m)
     return Dispersions(
         joint_is="locked" if joint is None else "flexible",
         mass=MassDispersions(
-            aeroshell_mass=normal(stated.mass),
-            centerbody_mass=normal(stated.mass),
-            aeroshell_inertia=normal(stated.inertia),
-            centerbody_inertia=normal(stated.inertia),
-            aeroshell_cg_station_m=shift(stated.cg_station_m),
-            centerbody_cg_station_m=shift(stated.cg_station_m),
-            offset_y_m=shift(stated.cg_lateral_m),
-            offset_z_m=shift(stated.cg_lateral_m),
+            aeroshell_mass=mass, aeroshell_inertia=inertia, aeroshell_cg_station_m=station,
+            centerbody_mass=mass, centerbody_inertia=inertia, centerbody_cg_station_m=station,
+            offset_y_m=lateral, offset_z_m=lateral,
         ),
         aerodynamics=AeroDispersions(
-            ca=normal(stated.ca), cn=normal(stated.cn), cm=normal(stated.cm), cmq=shift(stated.cmq)
+            ca=Factor(normal=stated.ca), cn=Factor(normal=stated.cn), cm=Factor(normal=stated.cm),
+            cmq=Shift(normal=stated.cmq),
         ),
         joint=joint or JointDispersions(),
-    )
+    )  # fmt: skip
 
 
 def entry_bounds(
@@ -150,15 +148,8 @@ def entry_bounds(
         ended += diverged and k > 0
         if k % LANES == 0 or k == flights:
             report(k / flights, f"{what} flight {k} of {flights}")
-    return Bounds(
-        time_s=entry.start_s + RECORD_S * np.arange(entry.records),
-        alpha_total_deg=percentile_band(alpha[1:]),
-        normal_g=percentile_band(normal[1:]),
-        nominal_alpha_deg=alpha[0],
-        nominal_normal_g=normal[0],
-        flights=flights,
-        ended=ended,
-    )
+    time_s = entry.start_s + RECORD_S * np.arange(entry.records)
+    return Bounds(time_s, percentile_band(alpha[1:]), percentile_band(normal[1:]), alpha[0], normal[0], flights, ended)
 
 
 class _Entry:
@@ -168,7 +159,7 @@ class _Entry:
         air = flight.air
         below = np.flatnonzero((air.altitude_m < START_ALTITUDE_M) & (air.flight_path_angle_rad < 0.0))
         if not len(below):
-            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="entry-missing")
+            raise GateError("pre-flight bounds: the reconstruction never comes below 100 km", code="time-not-covered")
         self.start_s = float(air.time_s[below[0]])
         pulse_end_s = float(air.time_s[np.flatnonzero(pressure_pulse(air.dynamic_pressure_pa))[-1]])
         span = max(SPAN_S, pulse_end_s - self.start_s)
@@ -178,7 +169,7 @@ class _Entry:
         self.profile = profile_from_sounding(flight.telemetry.sounding)
         self.at_start = resample(flight.solution.smoothed, np.array([self.start_s]))
         turning_radps = fastest_radps(vehicle, flight.solution, air)
-        steps = round(RECORD_S / (RIGID_STEP_S if self.locked else min(FLEXIBLE_STEP_S, resolving_step_s(vehicle))))
+        steps = 3 if self.locked else round(RECORD_S / min(0.005, resolving_step_s(vehicle)))
         steps = max(steps, int(np.ceil(RECORD_S * turning_radps / STEP_RAD)))
         self.schedule = Schedule(RECORD_S / steps, steps, self.records, self.records if self.locked else 0)
 
@@ -216,7 +207,7 @@ class _Entry:
     def _kept(self, flown: Flown, start: Start, vehicle: Vehicle) -> tuple[FloatArray, FloatArray, bool]:
         if not len(flown.aux):
             message = "pre-flight bounds: a flight has no record; the reconstruction's state at 100 km cannot be flown"
-            raise GateError(message, code="no-record")
+            raise GateError(message, code="too-few-data")
         records = Records(flown.states, flown.aux, vehicle, start.atmosphere)
         tumbling = (records.alpha_total_deg > np.rad2deg(simulate.TUMBLE_RAD)) & (flown.aux[:, 3] > simulate.AIR_PA)
         last = int(np.argmax(tumbling)) if tumbling.any() else len(flown.aux) - 1

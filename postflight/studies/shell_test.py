@@ -32,7 +32,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import least_squares
 
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.tables import line_of, numbers, read_table, read_unit
 
 LABEL = "load test"
@@ -42,11 +42,7 @@ _LOADS = {"n": ("force", 1.0), "kn": ("force", 1e3), "lbf": ("force", 4.44822161
 }  # fmt: skip
 LEAST_ROWS, MOST_ROWS = 20, 2000  # more rows than that are thinned: their residuals are no more independent
 MOST_SHARE = 0.9  # as the vehicle file
-STARTS = (0.03, 0.3)  # first time constants, of the length of the test
 AT_BOUND = 0.02  # of a logarithm
-CUBIC_STEPS = 60
-# over which errors may last: from what is white to what lasts as long as the test; how many lengths are tried
-SHORTEST_ROWS, LONGEST_OF_TEST, PERSISTENCES = 0.2, 1.0, 40
 
 
 @dataclass(frozen=True)
@@ -90,17 +86,17 @@ def read_load_test(
     GateError
         With every fault of the table.
     """
-    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[str]()
+    frame, faults = read_table(path, LABEL, LEAST_ROWS - 1), list[Issue]()
     t = _column(frame, time, ("time",), None, path, faults)
     moment = _column(frame, load, ("force", "moment"), arm_m, path, faults)
     angles = [_column(frame, name, ("length", "angle"), arm_m, path, faults) for name in displacements]
     if t is not None and not np.isfinite(t).all():
         row = int(np.argmin(np.isfinite(t)))
-        faults.append(Fault(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "time-missing"))
+        faults.append(Issue(f"{LABEL}: {path}: line {line_of(frame, row)}: no time", "column-missing"))
     elif t is not None and np.any(np.diff(t) <= 0.0):
         row = int(np.argmax(np.diff(t) <= 0.0)) + 1
         words = f"{LABEL}: {path}: line {line_of(frame, row)}: time {t[row]:g} s is not after {t[row - 1]:g} s"
-        faults.append(Fault(words, "time-order"))
+        faults.append(Issue(words, "time-backwards"))
     if faults:
         raise GateError(faults)
     assert t is not None
@@ -113,7 +109,7 @@ def read_load_test(
         words = f"{LABEL}: {path}: {len(test.time_s)} rows with load and displacement; {LEAST_ROWS} are needed"
         raise GateError(words, code="too-few-rows")
     if not (np.ptp(test.moment_nm) > 0.0 and test.largest_rad > 0.0):
-        raise GateError(f"{LABEL}: {path}: load and displacement must both change", code="load-constant")
+        raise GateError(f"{LABEL}: {path}: load and displacement must both change", code="too-few-data")
     if np.polyfit(test.moment_nm, test.angle_rad, 1)[0] <= 0.0:
         words = f"{LABEL}: {path}: displacement falls as the load grows; change the sign of one of them"
         raise GateError(words, code="load-sign")
@@ -121,7 +117,7 @@ def read_load_test(
 
 
 def _column(
-    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[str]
+    frame: pd.DataFrame, asked: str, kinds: tuple[str, ...], arm_m: float | None, path: Path, faults: list[Issue]
 ) -> FloatArray | None:
     """Column in SI; a force or a length with the arm as moment or angle."""
     name, _, unit = asked.partition(":")
@@ -129,14 +125,14 @@ def _column(
     if name not in frame.columns:
         columns = ", ".join(frame.columns)
         hint = nearest_name(name, list(frame.columns))
-        faults.append(Fault(f"{LABEL}: {path}: no column '{name}'{hint}; columns: {columns}", "column-missing"))
+        faults.append(Issue(f"{LABEL}: {path}: no column '{name}'{hint}; columns: {columns}", "column-missing"))
         return None
     read = read_unit(unit)
     kind, factor = _LOADS.get(unit.lower()) or ((read.kind, read.factor) if read else ("unknown", 1.0))
     if kind not in kinds:
         words = f"{LABEL}: {path}: column '{name}': unit '{unit}' is not one of {' or '.join(kinds)}; write"
         faults.append(
-            Fault(f"{words} {name}:UNIT (n, kn, lbf, nm, knm, lbfft; m, mm, deg, rad; s, min)", "unit-unknown")
+            Issue(f"{words} {name}:UNIT (n, kn, lbf, nm, knm, lbfft; m, mm, deg, rad; s, min)", "unit-unknown")
         )
         return None
     values = numbers(frame, name, path, LABEL, faults) * factor
@@ -144,7 +140,7 @@ def _column(
         return values
     if arm_m is None:
         words = f"{LABEL}: {path}: column '{name}' is a {kind}: state its lever arm about the joint with --arm-m"
-        faults.append(Fault(words, "arm-missing"))
+        faults.append(Issue(words, "input-missing"))
         return None
     return values * arm_m if kind == "force" else values / arm_m
 
@@ -253,7 +249,8 @@ def _fitted(test: LoadTest, laws: tuple[str, ...]) -> LawFit:
     if "creep" in laws:
         lower, upper = [*lower, 0.0, low, -np.inf], [*upper, MOST_SHARE / (1.0 - MOST_SHARE), high, np.inf]
         length = float(np.ptp(test.time_s))
-        starts = [[*starts[0], 0.3, float(np.clip(np.log(part * length), low, high)), 0.0] for part in STARTS]
+        # first time constants, of the length of the test: a few percent, and a third
+        starts = [[*starts[0], 0.3, float(np.clip(np.log(part * length), low, high)), 0.0] for part in (0.03, 0.3)]
     if "hardening" in laws:
         lower, upper, starts = [*lower, 0.0], [*upper, np.inf], [[*start, 0.1] for start in starts]
 
@@ -280,7 +277,8 @@ def _persistence(slope: FloatArray, off: FloatArray) -> tuple[float, float]:
         return np.concatenate([values[:1], (values[1:] - keep * values[:-1]) / np.sqrt(1.0 - keep**2)])
 
     best = -np.inf, 0.0, 0.0
-    for keep in np.exp(-1.0 / np.geomspace(SHORTEST_ROWS, LONGEST_OF_TEST * n, PERSISTENCES)).tolist():
+    # errors may last from a fifth of a row, which is white, to the length of the test
+    for keep in np.exp(-1.0 / np.geomspace(0.2, n, 40)).tolist():
         q, r = np.linalg.qr(whitened(slope, keep))
         left = whitened(off, keep)
         square = float(left @ left - np.sum((q.T @ left) ** 2))
@@ -318,7 +316,7 @@ def predicted(test: LoadTest, laws: tuple[str, ...], x: FloatArray) -> FloatArra
 def _cubic(load: FloatArray, cubic: float) -> FloatArray:
     """Root (n,) of ``d + cubic d^3 = load`` by Newton's steps, for a cubic term of no negative sign."""
     d = load.copy()
-    for _ in range(CUBIC_STEPS):
+    for _ in range(60):
         step = (d + cubic * d**3 - load) / (1.0 + 3.0 * cubic * d * d)
         d -= step
         if np.abs(step).max() < 1e-12 * max(1.0, np.abs(d).max()):

@@ -11,7 +11,7 @@ from estimators.body_edge import UNMOVED, _followed, body_edge
 from estimators.camera import without_moved
 from estimators.edge import KeptPicture, no_horizon
 from estimators.frame_solution import refused_fit
-from flightmodel.checks import Fault
+from flightmodel.checks import Issue
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 
 ALONE = GEOMETRY.model_copy(update={"features": "none"})
@@ -62,8 +62,8 @@ def test_where_nothing_is_seen_of_it_nothing_is_said(frames, oriented):
 
 
 def test_frames_that_do_not_show_it_go_with_their_neighbours():
-    out = refused_fit(no_horizon(Fault("")), Fault("moved", "camera-turned"), 5.0)
-    answered = replace(out, refused=Fault(""), mount_px=0.0)
+    out = refused_fit(no_horizon(Issue("")), Issue("moved", "camera-turned"), 5.0)
+    answered = replace(out, refused=Issue(""), mount_px=0.0)
     unseen = replace(answered, mount_px=float("nan"))
     fits = [unseen, answered, unseen, answered, unseen, out, unseen, unseen]
     assert [bool(fit.refused) for fit in without_moved(fits)] == [False] * 4 + [True] * 4
@@ -77,7 +77,7 @@ def test_a_camera_that_moved_along_it_is_noticed_in_two_frames(frames, oriented)
     assert np.linalg.norm(off) > np.deg2rad(1.0)
     assert all(fit.mount_px > 2.0 and not fit.mount_is_sure for fit in spoilt)
     sound = [oriented.fit(frame) for frame in frames[1:]]
-    answered = replace(spoilt[0], refused=Fault(""))
+    answered = replace(spoilt[0], refused=Issue(""))
     assert not any(fit.refused for fit in without_moved([sound[0], answered, sound[1]]))
     assert not any(fit.refused for fit in without_moved([answered]))
     together = without_moved([sound[0], answered, answered, sound[1]])

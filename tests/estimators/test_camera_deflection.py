@@ -19,7 +19,7 @@ from estimators.frame_solution import refused_fit
 from estimators.overlay import Overlay
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
-from flightmodel.checks import Fault, GateError
+from flightmodel.checks import GateError, Issue
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, dot_positions
 from flightmodel.vehicle import CameraMount
@@ -289,7 +289,7 @@ def test_frames_that_cannot_be_used_are_refused_with_a_reason(tmp_path):
     history = read.history()
     np.testing.assert_array_equal(np.isnan(history.theta_rad), [False] + [True] * 6 + [False])
     codes = {fit.refused.code for fit in read.fits if fit.refused}
-    of_frame = {"frame-dark", "frame-saturated", "frame-size", "frame-undecodable"}
+    of_frame = {"frame-exposure", "frame-size", "frame-undecodable"}
     assert codes == of_frame | {"edge-not-clear", "frame-broken"}
     counts = numbers_in(history.assumptions)
     assert (6.0, 8.0) in itertools.pairwise(counts)
@@ -323,7 +323,7 @@ def test_without_an_edge_in_the_benchmark_frame_no_edge_is_a_share_of_it(monkeyp
 
 def test_an_assumed_plane_without_edge_is_refused_by_its_reason(monkeypatch):
     """In it the edge alone counts: features can carry a film of which the rim is hidden, but not in a stated plane."""
-    none = Fault("too few points", "edge-points-too-few")
+    none = Issue("too few points", "edge-points-too-few")
     monkeypatch.setattr(OrientedCamera, "fit", lambda *_: refused_fit(no_horizon(none), none))
     monkeypatch.setattr(OrientedCamera, "edge_in_view", 0.25)
     frames, times = film(4, [0.0, 3.0], [0.0, 175.0]), np.array([421.0, 440.0])
@@ -363,9 +363,9 @@ def test_gates_name_what_is_wrong():
     ahead = MOUNT.model_copy(update={"axis_from_forward_deg": 178.0})
     for times, pictures, mount, code in (
         ([421.0], frames, ahead, "edge-out-of-view"),
-        ([421.0, 422.0], frames, MOUNT, "frame-count"),
-        ([440.0], frames, MOUNT, "benchmark-missing"),
-        ([421.0], [np.zeros_like(frames[0])], MOUNT, "frame-dark"),
+        ([421.0, 422.0], frames, MOUNT, "argument-value"),
+        ([440.0], frames, MOUNT, "time-not-covered"),
+        ([421.0], [np.zeros_like(frames[0])], MOUNT, "frame-exposure"),
     ):
         with pytest.raises(GateError) as refusal:
             read_film(np.array(times), pictures, GEOMETRY, mount, JOINT_M)

@@ -137,7 +137,7 @@ def test_a_camera_of_few_frames_is_not_used():
     assert [one.name for one in joined.readings] == ["a"]
     with pytest.raises(DivergenceError) as fault:
         join_cameras(cameras[1:])
-    assert fault.value.codes == ("too-few-readings",)
+    assert fault.value.codes == ("too-few-data",)
 
 
 def test_a_camera_switched_on_under_load_is_held_by_the_others():

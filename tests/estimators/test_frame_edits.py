@@ -112,7 +112,7 @@ def test_marked_features_measure_what_the_edge_alone_does_not(frames):
     off = CameraEdits(tuple(rows_of("feature", 421.0, [(360.0, 5.0)], "sky")))
     with pytest.raises(GateError) as refusal:
         read(frames, off, bare())
-    assert refusal.value.codes == ("edit-off-shell",)
+    assert refusal.value.codes == ("edit-unusable",)
 
 
 def test_frames_are_rejected_and_accepted_by_hand(frames):

@@ -28,7 +28,7 @@ from estimators.frame_solution import FrameFit, NoFitError, refused_fit
 from estimators.virtual_camera import deformation_of
 from flightmodel.camera import camera_from_mount
 from flightmodel.camera_edits import NO_EDITS
-from flightmodel.checks import NO_FAULT, Fault
+from flightmodel.checks import NO_FAULT, Issue
 from flightmodel.film import burnt_in
 from flightmodel.vehicle import read_vehicle
 from postflight.checks.folder_check import benchmark_frame, text_in_films
@@ -255,7 +255,7 @@ def test_check_tries_the_benchmark_frame():
     (remark,) = benchmark_frame(found(picture, "drawn"))
     assert remark.code == "features-not-found"
     (remark,) = benchmark_frame(found(np.zeros((480, 720), dtype=np.uint8), "texture"))
-    assert remark.code == "frame-dark"
+    assert remark.code == "frame-exposure"
     text = np.zeros(picture.shape, dtype=bool)
     text[20:60, 40:400] = True
     assert text_in_films(found(picture, "texture")) == []
@@ -318,12 +318,12 @@ def test_a_picture_with_oblong_pixels_is_refused():
 
 
 @pytest.mark.parametrize(("code", "refused", "left"), [
-    ("edge-too-short", 11, 0), ("edge-too-short", 10, 10), ("frame-dark", 15, 5),
+    ("edge-too-short", 11, 0), ("edge-too-short", 10, 10), ("frame-exposure", 15, 5),
 ])  # fmt: skip
 def test_a_film_of_which_most_frames_show_no_shell_has_no_answer(code, refused, left):
     fits = answers(np.full(20, 2.0))
     for k in range(refused):
-        fits[k] = refused_fit(no_horizon(NO_FAULT), Fault("no shell", code))
+        fits[k] = refused_fit(no_horizon(NO_FAULT), Issue("no shell", code))
     found = without_remnants(fits)
     assert sum(not fit.refused for fit in found) == left
     if not left:

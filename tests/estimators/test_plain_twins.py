@@ -286,43 +286,6 @@ def centres(images, noise, sign=1.0):
     return np.array(out).T
 
 
-def test_the_share_is_that_of_the_turn_that_most_points_agree_with():
-    rng, limits = np.random.default_rng(7), (2.0, 12.0, 0.5, 20, 0.0)
-    clock = np.linspace(0.3, 2.9, 40)
-    by_turn = 320.0 * np.column_stack([np.cos(clock), 0.8 * np.sin(clock)])
-    steps = rng.random((40, 53)) < 0.02
-    true = np.array([5.0, -8.0]) / np.hypot(*by_turn.T).max()
-    rows = np.flatnonzero(rng.random(40) < 0.8)
-    steps[rows, 26 + np.round(by_turn[rows] @ true / 0.5).astype(int)] = True
-    share, turn_rad = _edge_kernels.share_of_second_edge(steps, by_turn, limits)
-    expected = plain_horizon.share_of_second_edge(steps, by_turn, limits)
-    assert (share, turn_rad) == pytest.approx(expected, abs=1e-12)
-    assert share > 0.75
-    assert turn_rad == pytest.approx(np.hypot(*true), rel=0.15)
-    # above a share that is not reached there is none
-    for low in (0.5, share - 1e-9, share):
-        found = _edge_kernels.share_of_second_edge(steps, by_turn, (*limits[:4], low))
-        assert found == ((share, turn_rad) if low < share else (low, 0.0))
-    # too few points that a turn moves
-    assert _edge_kernels.share_of_second_edge(steps[:15], by_turn[:15], limits) == (0.0, 0.0)
-
-
-def test_rises_and_their_tops_are_numpy_s():
-    grey = np.random.default_rng(3).normal(100.0, 9.0, (12, 41))
-    rise, first, steps = np.empty((12, 39)), np.empty(12), np.empty((12, 39), dtype=np.bool_)
-    _edge_kernels.rises_over_pixel(grey, 2, rise, first)
-    up = grey[:, 2:] - grey[:, :-2]
-    near = up[:, 17:22]
-    steepest = near[np.arange(12), np.abs(near).argmax(axis=1)]
-    np.testing.assert_array_equal(first, np.abs(steepest))
-    np.testing.assert_array_equal(rise, up * np.sign(steepest)[:, None])
-    least = 0.3 * first
-    _edge_kernels.tops(rise, least, steps)
-    inner = rise[:, 1:-1]
-    expected = (inner >= rise[:, :-2]) & (inner >= rise[:, 2:]) & (inner > least[:, None])
-    np.testing.assert_array_equal(steps, np.pad(expected, ((0, 0), (1, 1))))
-
-
 @pytest.mark.parametrize("top", [0.0, 9.0])
 def test_the_first_step_on_a_line_is_the_plain_one(top):
     """A plain body, a step behind it, steps behind that; lines that begin or end beyond the picture, or find none."""
@@ -356,23 +319,6 @@ def test_a_point_is_coherent_with_most_of_the_places_beside_it():
     np.testing.assert_array_equal(found, alike.sum(axis=1) > 4)
     assert 5 < found.sum() < len(line) - 5
     assert not len(is_coherent(line[:0], residual[:0]))
-
-
-def test_rows_differ_as_in_whole_numbers():
-    image = np.random.default_rng(9).integers(0, 256, (54, 75)).astype(np.uint8)
-    image[20:] = 255 - image[20:] // 2
-    one, two, steps = np.empty((3, 2)), np.empty((3, 2)), np.empty(53)
-    _edge_kernels.row_differences(image, 16, 32, 4, 16, one, two, steps)
-    for found, expected in zip((one, two, steps), plain_horizon.row_differences(image, 16, 32, 4, 16), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 1000])
-def test_the_middle_is_the_median(count):
-    values = np.random.default_rng(count).normal(size=(count, 3))[:, :2]
-    for levels in (values, np.rint(values), np.zeros_like(values)):
-        for some in (levels, levels[:, :1].copy()):
-            assert _edge_kernels.middle_of_sizes(some, 64) == np.median(np.abs(some))
 
 
 def patch_of(rng):

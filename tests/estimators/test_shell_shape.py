@@ -9,12 +9,12 @@ import pytest
 
 from estimators.camera import FilmFit, read_film
 from estimators.camera_fit import OrientedCamera
-from estimators.edge import NO_FAULT, no_horizon
+from estimators.edge import no_horizon
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.frame_residuals import FrameShape
 from estimators.frame_solution import AprioriSd, FrameFit
 from estimators.shell_shape import HYPOTHESES, LOBES, MODES, LoadedFilm, mode_sd_rad, shell_shape, with_shape
-from flightmodel.checks import GateError
+from flightmodel.checks import NO_FAULT, GateError
 from flightmodel.statistics import correlation
 from synthetic_flight.film import Imaging, Scene, Warp
 from synthetic_flight.film import film as rendered
@@ -178,7 +178,7 @@ def test_frames_of_one_load_tell_nothing():
     assert refusal.value.codes == ("loads-alike",)
     with pytest.raises(GateError) as refusal:
         shell_shape([LoadedFilm(film.film, np.where(np.arange(len(TIME_S)) < 5, PRESSURE_PA, np.nan))])
-    assert refusal.value.codes == ("too-few-frames",)
+    assert refusal.value.codes == ("too-few-data",)
 
 
 def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():

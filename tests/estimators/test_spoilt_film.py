@@ -18,7 +18,7 @@ from estimators.frame_edits import EditedFrame
 from estimators.frame_solution import POSED, TURN, AprioriSd, refused_fit
 from estimators.virtual_camera import VirtualCamera, deformation_of
 from flightmodel.camera import camera_from_mount
-from flightmodel.checks import Fault, GateError
+from flightmodel.checks import GateError, Issue
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, film
 from tests.estimators.test_other_film import answers
 from tests.refusing import numbers_in
@@ -240,7 +240,7 @@ def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
     fits = answers(np.linspace(1.0, 2.0, 10))
 
     def codes(*refused, code="camera-turned"):
-        spoilt = [refused_fit(f.horizon, Fault("no", code)) if k in refused else f for k, f in enumerate(fits)]
+        spoilt = [refused_fit(f.horizon, Issue("no", code)) if k in refused else f for k, f in enumerate(fits)]
         return [k for k, f in enumerate(without_doubtful(spoilt))
                 if f.refused and f.refused.code == "frames-around-refused"]  # fmt: skip
 
@@ -249,7 +249,7 @@ def test_an_answer_among_frames_that_contradict_the_shell_is_doubted():
     assert codes(4, 6) == [5]
     assert codes(7, 8) == [6, 9]
     assert codes(4, 6, code="shell-little-seen") == [5]
-    assert codes(4, 6, code="frame-dark") == []
+    assert codes(4, 6, code="frame-exposure") == []
 
 
 def test_part_of_an_edge_beside_hardly_a_feature_is_no_answer(frames):

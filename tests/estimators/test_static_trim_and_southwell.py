@@ -42,7 +42,7 @@ def test_divergence_and_margin():
     assert float(STATIC.trim_angle(stiffness, 0.004) / rigid) == pytest.approx(1.25)
     with pytest.raises(GateError) as refusal:
         STATIC.stiffness_for_growth(0.0)
-    assert refusal.value.codes == ("trim-growth-not-positive",)
+    assert refusal.value.codes == ("value-range",)
     with pytest.raises(GateError) as refusal:
         static_trim(replace(VEHICLE, aero=VEHICLE.aero.scaled(cm=-1.0)), 3.2, 1180.0)
     assert refusal.value.codes == ("statically-unstable",)
@@ -122,10 +122,10 @@ def test_the_stiffness_of_a_stiff_joint_is_not_observable():
     q = np.linspace(150.0, 1180.0, 9)
     with pytest.raises(DivergenceError) as refusal:
         southwell(q, 1e-5 * q, np.full(9, 1e-4))
-    assert refusal.value.codes == ("stiffness-not-observable",)
+    assert refusal.value.codes == ("not-observable",)
     with pytest.raises(DivergenceError) as refusal:
         southwell(q[:3], 1e-5 * q[:3], np.full(3, 1e-4))
-    assert refusal.value.codes == ("too-few-spans",)
+    assert refusal.value.codes == ("too-few-data",)
 
 
 def test_a_deflection_at_the_largest_load_alone_diverges_there_without_a_warning():

@@ -158,7 +158,7 @@ def test_wind_axes_reference_and_damping_rate(tmp_path):
 
 def test_sidecar_is_required_and_every_fault_of_both_is_named(tmp_path):
     path = write_table(tmp_path)
-    with refuses("sidecar-missing", names=["source"], kind=ConfigError):
+    with refuses("file-missing", names=["source"], kind=ConfigError):
         read_with_sidecar(path)
     path = write_table(tmp_path, sidecar={"sorce": "us", "area_m2": -1.0, "length_m": 3.0, "axes": "stability"})
     path.write_text(path.read_text().replace("mach,", "M,").replace("1.5,", "x,", 1))
@@ -177,7 +177,7 @@ def test_header_in_capitals_is_read_and_other_names_are_told_with_the_nearest(tm
     np.testing.assert_array_equal(read_with_sidecar(path)[0].coefficients, small.coefficients)
     path.write_text(path.read_text().replace("Mach,Alpha_deg,CA,CN,CM,Cmq", "Mach No,AoA (deg),CA,CN,Cm_nose,CN_alpha"))
     names = [r"\bmach, alpha_deg, cm, cmq\b", re.escape("Mach No, AoA (deg), ca, cn, Cm_nose, CN_alpha")]
-    with refuses("aero-column-missing", names=names) as caught:
+    with refuses("column-missing", names=names) as caught:
         read_with_sidecar(path)
     hints = re.findall(r"'([^']+)'[^;]*? (\w+):", str(caught.value))
     assert hints == [("Mach No", "mach"), ("AoA (deg)", "alpha_deg"), ("Cm_nose", "cm")]
@@ -230,16 +230,16 @@ def test_daveml_comes_in_through_a_vehicles_table_with_a_sidecar():
 @pytest.mark.parametrize(
     ("old", "new", "codes", "name"),
     [
-        ('units="deg"><isInput/>', 'units="mil"><isInput/>', "daveml-unit", "mil"),
-        ('varID="ALPHAT" units', 'varID="SIDESLIP" units', "daveml-input", "ALPHAT"),
-        ('name="normalForceCoefficient" varID="CN"', 'name="yaw" varID="Cn"', "daveml-variable", "CN"),
-        ("1.5, 3.0, 6.0", "1.5, 1.5, 6.0", "daveml-breakpoints", ""),
-        ("0.2 -0.2 -0.3", "0.2 -0.2", "daveml-breakpoints", "2 values"),
+        ('units="deg"><isInput/>', 'units="mil"><isInput/>', "daveml-unsupported", "mil"),
+        ('varID="ALPHAT" units', 'varID="SIDESLIP" units', "daveml-unsupported", "ALPHAT"),
+        ('name="normalForceCoefficient" varID="CN"', 'name="yaw" varID="Cn"', "daveml-unsupported", "CN"),
+        ("1.5, 3.0, 6.0", "1.5, 1.5, 6.0", "file-unreadable", ""),
+        ("0.2 -0.2 -0.3", "0.2 -0.2", "file-unreadable", "2 values"),
         ("0.2 -0.2 -0.3", "0.2 x -0.3", "daveml-breakpoints daveml-numbers", ""),
-        ("<griddedTableRef gtID=", "<ungriddedTableRef utID=", "daveml-ungridded", ""),
-        ('<dependentVarRef varID="CA"/>', '<dependentVarRef varID="CX"/>', "daveml-variable", "CA"),
+        ("<griddedTableRef gtID=", "<ungriddedTableRef utID=", "daveml-unsupported", ""),
+        ('<dependentVarRef varID="CA"/>', '<dependentVarRef varID="CX"/>', "daveml-unsupported", "CA"),
         ("0 30 60 90 180", "0 30 60 90 170", "aero-grid", "180|170"),
-        ("<DAVEfunc xmlns", "<DAVE xmlns", "daveml-not-xml", ""),
+        ("<DAVEfunc xmlns", "<DAVE xmlns", "file-unreadable", ""),
     ],
 )
 def test_daveml_refuses_what_it_does_not_understand(tmp_path, old, new, codes, name):
@@ -266,5 +266,5 @@ def test_daveml_never_expands_entities_nor_opens_other_files(tmp_path):
     ):
         evil = text.replace(head, f"<!DOCTYPE DAVEfunc [{subset}]>\n").replace("1.5, 3.0, 6.0", use)
         (tmp_path / "evil.dml").write_text(evil)
-        with refuses("daveml-doctype"):
+        with refuses("file-unreadable"):
             read_daveml(tmp_path / "evil.dml")

@@ -167,9 +167,9 @@ def test_terms_of_many_turned_cameras_are_those_of_each(camera, lens):
 
 
 def test_a_camera_that_is_no_camera_is_refused(camera):
-    with refuses("camera-rotation"):
+    with refuses("argument-value"):
         replace(camera, dcm_cam_body=np.diag([1.0, 1.0, -1.0]))
-    with refuses("array-shape"):
+    with refuses("argument-value"):
         replace(camera, distortion=np.zeros(5))
 
 

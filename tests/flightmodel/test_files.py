@@ -157,5 +157,5 @@ def test_absent_files_are_named_with_the_faults_of_the_keys(tmp_path):
         read_flight_file(tmp_path)
     absent = [str(f) for f in caught.value.faults if f.code == "file-missing"]
     assert [f.split("'")[1] for f in absent] == ["vehicle", "radars.a.file", "radars.b.file"]
-    with refuses("folder-missing", names=(f"folder is wanted: {tmp_path}",), kind=ConfigError):
+    with refuses("file-missing", names=(f"folder is wanted: {tmp_path}",), kind=ConfigError):
         read_flight_file(tmp_path / "flight.toml")

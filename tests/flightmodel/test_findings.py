@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from flightmodel import gate
-from flightmodel.checks import Fault
+from flightmodel.checks import Issue
 from flightmodel.gate import find_faults, findings_of_runs, runs
 from tests.refusing import numbers_in
 
@@ -60,7 +60,7 @@ def test_of_very_many_the_longest_are_told_and_the_others_together(count):
     first = np.cumsum(np.append(5, length[:-1] + rng.integers(1, 9, size=count - 1)))
     last = first + length - 1
     time_s = np.arange(last[-1] + 1) * 0.01
-    found = findings_of_runs("s", time_s, first, last, lambda k: Fault(f"{length[k]} samples", "run"), "runs")
+    found = findings_of_runs("s", time_s, first, last, lambda k: Issue(f"{length[k]} samples", "run"), "runs")
     alone = found[: gate.MANY]
     assert len(alone) == min(count, gate.MANY)
     assert [f.start_s for f in alone] == sorted(f.start_s for f in alone)

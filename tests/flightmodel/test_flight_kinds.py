@@ -114,7 +114,7 @@ def test_where_no_undulation_is_stated_the_model_gives_it(folder):
     np.testing.assert_allclose(up, np.tile([0.0, 0.0, -expected], (len(T), 1)), atol=1e-3)
     raised = after.barometers["baro"].height_m - before.barometers["baro"].height_m
     np.testing.assert_allclose(raised, expected, atol=1e-3)
-    assert [f.source for f in after.findings if f.code == "undulation-by-model"] == ["gps", "baro"]
+    assert [f.source for f in after.findings if f.code == "values-converted"] == ["gps", "baro"]
 
 
 def test_ecef_columns_are_read_before_geodetic_ones_and_velocities_either_way(folder):
@@ -149,11 +149,11 @@ def test_a_receiver_of_velocities_alone_is_read(folder):
     assert "speed_sd_mps" in telemetry.assumed["gnss.doppler"]
     # local and inertial axes need a place
     inertial = alone + 'axes = "inertial"\n'
-    folder.refused([GNSS, inertial, BALLISTIC], "table-column-missing", "x_ecef_m", kind=GateError)
+    folder.refused([GNSS, inertial, BALLISTIC], "column-missing", "x_ecef_m", kind=GateError)
     folder.table("doppler.csv", "t_s,vn_mps,ve_mps,vd_mps", T, T, T, T)
-    folder.refused([GNSS, alone, BALLISTIC], "table-column-missing", "vx_ecef_mps", kind=GateError)
+    folder.refused([GNSS, alone, BALLISTIC], "column-missing", "vx_ecef_mps", kind=GateError)
     folder.table("doppler.csv", "t_s,vx_ecef_mps,vy_ecef_mps,vz_ecef_mps", T, T, T, np.nan * T)
-    folder.refused([GNSS, alone, BALLISTIC], "no-samples", "velocity", kind=GateError)
+    folder.refused([GNSS, alone, BALLISTIC], "too-few-rows", "velocity", kind=GateError)
 
 
 def test_noise_of_its_own_for_each_fix(folder):
@@ -196,7 +196,7 @@ def test_weak_fixes_are_left_out_and_counted(folder):
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,sats", T, LAT + 0 * T, LON + 0 * T, 1400 + T, nsat)
     telemetry = folder.read(GNSS, 'min_satellites = 7\nsatellites_column = "sats"', BALLISTIC)
     assert telemetry.gnss["gps"].time_s[0] == 5.0
-    assert numbers_in(findings(telemetry, "gps")["fixes-poor"]) == [10.0, 40.0, 7.0]
+    assert numbers_in(findings(telemetry, "gps")["too-few-rows"]) == [10.0, 40.0, 7.0]
 
 
 def test_a_fix_that_is_held_until_the_next_counts_once(folder):
@@ -209,13 +209,13 @@ def test_a_fix_that_is_held_until_the_next_counts_once(folder):
     np.testing.assert_array_equal(record.time_s, np.arange(0.0, 17.0, 2.0))
     np.testing.assert_allclose(record.sd[:, 0], 2 + record.time_s)
     found = findings(telemetry, "gps")
-    assert numbers_in(found["fixes-held"]) == [31.0, 40.0, 3.5]
+    assert numbers_in(found["rows-left-out"]) == [31.0, 40.0, 3.5]
     assert "data-frozen" not in found
     # what moves in one column is a fix of its own, and so is one without a position where the velocity goes on
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,vn_mps,ve_mps,vd_mps", T, *fix, T, 0 * T, 0 * T)
     telemetry = folder.read(GNSS, BALLISTIC)
     assert len(telemetry.gnss["gps"].time_s) == len(T)
-    assert "fixes-held" not in findings(telemetry, "gps")
+    assert "rows-left-out" not in findings(telemetry, "gps")
 
 
 def test_empty_cells_are_missing_fixes(folder):
@@ -232,7 +232,7 @@ def test_barometer_by_height_and_by_pressure(folder):
     folder.table("baro.csv", "t_s,pressure_pa", T, us76(true)[2])
     telemetry = folder.read(GNSS, BARO, BALLISTIC)
     np.testing.assert_allclose(telemetry.barometers["baro"].height_m, true, atol=0.01)
-    assert "use_s" in findings(telemetry, "baro")["heights-from-pressure"]
+    assert "use_s" in findings(telemetry, "baro")["values-converted"]
 
 
 def test_pressure_height_follows_the_days_air():
@@ -325,7 +325,7 @@ def test_use_s_and_offset_and_repeats(folder):
     np.testing.assert_allclose(record.time_s, inside + 2.0)
     np.testing.assert_allclose(record.height_m, 1400 + 10 * inside)
     told = findings(telemetry, "baro")
-    assert numbers_in(told["rows-repeated"]) == [4.0]
+    assert numbers_in(told["rows-left-out"]) == [4.0]
     assert numbers_in(told["rows-outside-span"]) == [26.0, 40.0, 2.0, 6.0, 10.0, 12.0]
 
 
@@ -395,14 +395,14 @@ def test_mounts_that_contradict_or_lack_a_vehicle_are_refused(folder):
     folder.refused(
         [GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "body"\naxes = ["+x", "+y", "+z"]')], "keys-conflict"
     )
-    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "suba"')], "mount-missing", 'mount = "body"')
-    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"\n', "")], "mount-missing")
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "suba"')], "input-missing", 'mount = "body"')
+    folder.refused([GNSS, PRIOR, TRIADS.replace('mount = "body"\n', "")], "input-missing")
     place = 'mount = "suba"\nposition_from_datum_body_m = [0.0, 0.0, 0.0]'
     folder.refused(
         [GNSS, PRIOR, TRIADS.replace('mount = "body"', place)], "keys-conflict", "position_from_datum_body_m"
     )
     named = ['vehicle = "irve2_reference"', GNSS, PRIOR, TRIADS.replace('mount = "body"', 'mount = "sub"')]
-    folder.refused(named, "mount-unknown", "sensors.accelerometer.mount = 'sub'", "suba")
+    folder.refused(named, "name-unknown", "sensors.accelerometer.mount = 'sub'", "suba")
 
 
 def test_heights_above_what_must_be_said(folder):
@@ -422,15 +422,15 @@ def test_bad_fixes_are_refused_by_line(folder):
     folder.table("gps.csv", "t_s,x_ecef_m,y_ecef_m,z_ecef_m", T, 0 * T, 0 * T, 0 * T)
     folder.refused([GNSS, BALLISTIC], "fix-impossible", "40 in all", kind=GateError)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg", T, LAT + 0 * T, LON + 0 * T)
-    folder.refused([GNSS, BALLISTIC], "table-column-missing", "alt_m", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "column-missing", "alt_m", kind=GateError)
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,vn_mps", T, LAT + 0 * T, LON + 0 * T, 1400 + T, T)
-    folder.refused([GNSS, BALLISTIC], "table-column-missing", "vd, ve", "velocity = false", kind=GateError)
+    folder.refused([GNSS, BALLISTIC], "column-missing", "vd, ve", "velocity = false", kind=GateError)
 
 
 def test_no_fix_good_enough_is_refused(folder):
     folder.table("gps.csv", "t_s,lat_deg,lon_deg,alt_m,nsat", T, LAT + 0 * T, LON + 0 * T, 1400 + T, 5 + 0 * T)
-    folder.refused([GNSS + "min_satellites = 6\n", BALLISTIC], "fixes-poor", "0 fixes", kind=GateError)
-    folder.refused([GNSS + "min_fix_mode = 3\n", BALLISTIC], "table-column-missing", "'fix_mode'", kind=GateError)
+    folder.refused([GNSS + "min_satellites = 6\n", BALLISTIC], "too-few-rows", "0 fixes", kind=GateError)
+    folder.refused([GNSS + "min_fix_mode = 3\n", BALLISTIC], "column-missing", "'fix_mode'", kind=GateError)
 
 
 def test_declaring_both_kinds_of_position_is_refused(folder):
@@ -451,7 +451,7 @@ def test_barometer_tables_that_are_not_clear_are_refused(folder):
         atol=1e-3,
     )
     folder.table("baro.csv", "t_s,alt", T, 1400 + T)
-    folder.refused([GNSS, BARO, BALLISTIC], "table-column-missing", "height_m", kind=GateError)
+    folder.refused([GNSS, BARO, BALLISTIC], "column-missing", "height_m", kind=GateError)
     folder.table("baro.csv", "t_s,pressure_pa", T, 860 * 1e3 - T)
     folder.refused([GNSS, BARO, BALLISTIC], "value-range", "baro.csv: line 2", kind=GateError)
 
@@ -486,7 +486,7 @@ def with_axes(axes):
             for line, code, name in (
                 ("use_s = [[5.0, 5.0]]", "key-value", "use_s"),
                 ("use_s = []", "key-value", "use_s"),
-                ("use_s = [[100.0, 200.0]]", "use-span-empty", "0 rows"),
+                ("use_s = [[100.0, 200.0]]", "too-few-rows", "0 rows"),
                 ("min_satelites = 6", "key-unknown", "'min_satellites'"),
                 ("horizontal_sd_m = 0.0", "key-value", "gnss.gps.horizontal_sd_m"),
                 ("time_bias_sd_s = 100.0", "key-value", "gnss.gps.time_bias_sd_s"),
@@ -495,7 +495,7 @@ def with_axes(axes):
                 ('time = { repeats = "last" }', "key-value", "repeats"),
                 ("geoid_undulation_m = 500.0", "key-value", "geoid_undulation_m"),
                 ("velocity = 1", "key-value", "velocity"),
-                ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "quantity-unknown", "'lat'"),
+                ('columns = { latt = { column = "lat_deg", unit = "deg" } }', "name-unknown", "'lat'"),
             )
         ),
     ],
@@ -505,7 +505,7 @@ def test_slips_of_the_pen_are_refused(folder, sections, code, names, kind):
 
 
 def test_a_name_stands_once_and_a_sounding_has_no_spans(folder):
-    folder.refused([GNSS, BARO.replace("barometers.baro", "barometers.gps"), BALLISTIC], "name-twice", "'gps'")
+    folder.refused([GNSS, BARO.replace("barometers.baro", "barometers.gps"), BALLISTIC], "given-twice", "'gps'")
     folder.table("air.csv", "alt_m,rho_kgpm3,t_k", T, 1.2 - 0.001 * T, 280 + T)
     folder.refused(
         [GNSS, BALLISTIC, '[atmosphere]\nfile = "air.csv"\nuse_s = [[0.0, 5.0]]'], "keys-conflict", "atmosphere.use_s"
@@ -533,7 +533,7 @@ def test_video_needs_a_vehicle(folder):
 
 def test_no_second_in_common_is_refused(folder):
     late = GNSS.replace('"gps.csv"', '"gps.csv"\ntime = { offset_s = 19.0 }')
-    folder.refused([late, TRIADS, PRIOR], "no-common-time", "accelerometer", "rates", "receivers", kind=GateError)
+    folder.refused([late, TRIADS, PRIOR], "time-not-covered", "accelerometer", "rates", "receivers", kind=GateError)
 
 
 # the survey that trackers share
@@ -553,7 +553,7 @@ def test_survey_and_places_are_read_in_si(folder):
 
 
 def test_no_tracker_is_called_as_all_sites_together(folder):
-    folder.refused([GNSS.replace("gnss.gps", "gnss.sites"), BALLISTIC], "name-twice", "sites")
+    folder.refused([GNSS.replace("gnss.gps", "gnss.sites"), BALLISTIC], "given-twice", "sites")
 
 
 # on the pad
@@ -568,7 +568,7 @@ def test_a_rest_is_read_and_stands_for_an_attitude(folder):
 
 
 def test_what_is_wrong_with_a_rest(folder):
-    folder.refused([GNSS, BALLISTIC, "[start]\nat_rest = [1.0, 3.0]\n"], "rest-without-inertial", "at_rest")
+    folder.refused([GNSS, BALLISTIC, "[start]\nat_rest = [1.0, 3.0]\n"], "keys-conflict", "at_rest")
     folder.refused([GNSS, TRIADS, PRIOR, "[start]\nat_rest = [3.0, 1.0]\n"], "keys-conflict", "at_rest")
     folder.refused([GNSS, TRIADS, PRIOR, "[start]\nazimuth_deg = 10.0\n"], "keys-conflict", "at_rest")
 
@@ -600,7 +600,7 @@ def test_what_is_wrong_with_a_part(folder):
     folder.table("site.csv", "t_s,az_deg,el_deg,el_sd_deg", T, T, 40.0 + T, 0.0 * T)
     eye = f"[radars.eye]\n{SITE}"
     # a column that is not there is refused unless the file says that it is not measured
-    folder.refused([GNSS, BALLISTIC, eye], "table-column-missing", "range_m", kind=GateError)
+    folder.refused([GNSS, BALLISTIC, eye], "column-missing", "range_m", kind=GateError)
     folder.refused([GNSS, BALLISTIC, eye, 'measures = ["az", "el"]\n'], "value-range", "el_sd", kind=GateError)
     folder.refused([GNSS, BALLISTIC, eye, "measures = []\n"], "key-value", "measures")
 

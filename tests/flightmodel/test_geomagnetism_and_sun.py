@@ -72,7 +72,7 @@ def test_one_place_and_a_place_held():
 
 
 def test_dates_without_coefficients_are_refused():
-    with refuses("epoch-range", names=["1900 to 2030"]):
+    with refuses("value-range", names=["1900 to 2030"]):
         magnetic_field_ned_t(0.5, 0.5, 0.0, "2031-01-01T00:00:00Z")
 
 

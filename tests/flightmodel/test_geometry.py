@@ -78,7 +78,7 @@ def test_limb_is_where_lines_of_sight_touch_the_torus(geometry, index):
 def test_a_viewpoint_inside_the_torus_is_refused(geometry):
     station, radius = shell.torus_circles(geometry)
     inside = -station[-1] * np.array([1.0, 0, 0]) + radius[-1] * lv_direction(1.0)
-    with refuses("viewpoint-inside", names=["torus"]):
+    with refuses("camera-inside-shell", names=["torus"]):
         shell.torus_limb(geometry, inside, np.array([1.0]))
 
 

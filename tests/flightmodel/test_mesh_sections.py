@@ -83,5 +83,5 @@ def test_a_feature_lies_on_the_mesh_where_that_departs_from_the_tori(tmp_path):
     np.testing.assert_allclose(np.hypot(*listed.points_shell_m[:, 1:].T), np.array(wanted)[:, 1], atol=1e-6)
     rows[1] = rows[1].replace(f",{wanted[1][1]:.6f},", f",{wanted[1][1] + 0.2:.6f},")
     (tmp_path / "marks.csv").write_text(HEAD + "\n".join(rows))
-    with refuses("feature-off-shell", names=["line 3"]):
+    with refuses("edit-unusable", names=["line 3"]):
         read_features(tmp_path / "marks.csv", shell)

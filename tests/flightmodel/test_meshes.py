@@ -129,27 +129,27 @@ def spoilt(drawn, how):
 @pytest.mark.parametrize(
     ("how", "code", "name"),
     [
-        ("hole", "mesh-not-watertight", "3 of"),
-        ("hole in obj", "mesh-not-watertight", "3 of"),
-        ("no bytes", "mesh-empty", ""),
-        ("no faces", "mesh-empty", ""),
-        ("no faces in ascii", "mesh-empty", ""),
-        ("no faces in obj", "mesh-empty", ""),
-        ("no faces in glb", "mesh-empty", ""),
-        ("cut stl", "mesh-unreadable", ""),
-        ("cut head", "mesh-unreadable", ""),
-        ("cut ascii", "mesh-unreadable", ""),
-        ("cut obj", "mesh-not-watertight", ""),
-        ("cut glb", "mesh-unreadable", ""),
-        ("other content", "mesh-unreadable", "STL"),
-        ("other content in glb", "mesh-unreadable", "GLB"),
+        ("hole", "mesh-unusable", "3 of"),
+        ("hole in obj", "mesh-unusable", "3 of"),
+        ("no bytes", "mesh-unusable", ""),
+        ("no faces", "mesh-unusable", ""),
+        ("no faces in ascii", "mesh-unusable", ""),
+        ("no faces in obj", "mesh-unusable", ""),
+        ("no faces in glb", "mesh-unusable", ""),
+        ("cut stl", "file-unreadable", ""),
+        ("cut head", "file-unreadable", ""),
+        ("cut ascii", "file-unreadable", ""),
+        ("cut obj", "mesh-unusable", ""),
+        ("cut glb", "file-unreadable", ""),
+        ("other content", "file-unreadable", "STL"),
+        ("other content in glb", "file-unreadable", "GLB"),
         ("not a number", "not-finite", ""),
-        ("wrong corner", "mesh-unreadable", ""),
-        ("many faces", "mesh-unreadable", "600000 .* 500000"),
-        ("claims", "mesh-unreadable", "500000"),
-        ("packed", "mesh-unreadable", "KHR_draco"),
-        ("elsewhere", "mesh-unreadable", "GLB"),
-        ("circle", "mesh-unreadable", ""),
+        ("wrong corner", "file-unreadable", ""),
+        ("many faces", "file-unreadable", "600000 .* 500000"),
+        ("claims", "file-unreadable", "500000"),
+        ("packed", "file-unreadable", "KHR_draco"),
+        ("elsewhere", "file-unreadable", "GLB"),
+        ("circle", "file-unreadable", ""),
     ],
 )
 def test_what_is_no_closed_mesh_is_refused_in_words(how, code, name, drawn, tmp_path):
@@ -179,12 +179,12 @@ def test_materials_in_other_files_are_not_followed(drawn, tmp_path):
 @pytest.mark.parametrize(
     ("change", "code", "name"),
     [
-        ({"unit_m": 1.0}, "mesh-size", "unit_m' = 1: shell.stl: .* 3000 m .* unit_m = 0.001"),
-        ({"unit_m": 0.0254}, "mesh-size", "76.21 m .* unit_m = 0.001"),
-        ({"forward": "-z"}, "mesh-pose", "nose"),
-        ({"forward": "y", "zero_clock": "z"}, "mesh-pose", "nose"),
-        ({"nose": [12.0, -7.0, -455.0]}, "mesh-pose", r"0.510 m .* nose = \[12.0, -7.0, 55.0\]"),
-        ({"nose": [262.0, -7.0, 55.0]}, "mesh-pose", "0.250 m .* 0.150 m"),
+        ({"unit_m": 1.0}, "mesh-unusable", "unit_m' = 1: shell.stl: .* 3000 m .* unit_m = 0.001"),
+        ({"unit_m": 0.0254}, "mesh-unusable", "76.21 m .* unit_m = 0.001"),
+        ({"forward": "-z"}, "mesh-unusable", "nose"),
+        ({"forward": "y", "zero_clock": "z"}, "mesh-unusable", "nose"),
+        ({"nose": [12.0, -7.0, -455.0]}, "mesh-unusable", r"0.510 m .* nose = \[12.0, -7.0, 55.0\]"),
+        ({"nose": [262.0, -7.0, 55.0]}, "mesh-unusable", "0.250 m .* 0.150 m"),
         ({"zero_clock": "-z"}, "keys-conflict", "meshes.aeroshell.zero_clock' = '-z'"),
         ({"file": "../shell.stl"}, "key-value", "file"),
         ({"file": "/shell.stl"}, "key-value", "file"),
@@ -204,7 +204,7 @@ def test_faults_of_both_bodies_come_at_once(geometry, drawn, tmp_path):
     as_drawn(centerbody_mesh(geometry), shift=(0.0, 0.0, 0.0)).export(tmp_path / "body.stl")
     body = {"file": "body.stl", "unit_m": 0.001, "forward": "z"}
     with refuses(
-        "mesh-size", "mesh-pose", names=["centerbody", r"-1\.580\b", r"\b0\.000\b"], kind=ConfigError
+        "mesh-unusable", "mesh-unusable", names=["centerbody", r"-1\.580\b", r"\b0\.000\b"], kind=ConfigError
     ) as caught:
         vehicle_with(tmp_path, aeroshell=SHELL | {"unit_m": 1.0}, centerbody=body | {"forward": "-z"})
     assert len(caught.value.faults) == 2
@@ -217,7 +217,7 @@ def test_a_camera_inside_a_mesh_is_named(geometry, tmp_path):
     wide = centerbody_mesh(geometry)
     wide.apply_scale([1.0, 1.2, 1.2])
     wide.export(tmp_path / "body.stl")
-    with refuses("lens-inside-mesh", names=["camera5_uncalibrated, camera5"], kind=ConfigError):
+    with refuses("mesh-unusable", names=["camera5_uncalibrated, camera5"], kind=ConfigError):
         vehicle_with(tmp_path, centerbody={"file": "body.stl", "unit_m": 1.0, "forward": "x"})
 
 
@@ -247,7 +247,7 @@ def test_rim_of_few_corners_off_the_axis_is_found():
 def test_a_real_capsule_is_scaled_and_laid_by_what_is_told_of_it(tmp_path):
     (tmp_path / "capsule.stl").write_bytes((REALDATA / "orion_full.stl").read_bytes())
     keys = {"file": "capsule.stl", "forward": "-y", "nose": [0.0, -2.6, 0.0]}
-    with refuses("mesh-size", names=[r"5\.023 m"], kind=ConfigError):
+    with refuses("mesh-unusable", names=[r"5\.023 m"], kind=ConfigError):
         vehicle_with(tmp_path, aeroshell=keys | {"unit_m": 0.308})
     mesh = vehicle_with(tmp_path, aeroshell=keys | {"unit_m": 0.184}).meshes["aeroshell"]
     assert len(mesh.faces) == 51736

@@ -76,5 +76,5 @@ def test_measured_profile():
     np.testing.assert_allclose(refracted(*place, LAT, HEIGHT, same), refracted(*place, LAT, HEIGHT, AIR), rtol=1e-9)
     humid = Refractivity(1.0, 7000.0, heights, 350.0 * np.exp(-heights / 7000.0) + 60.0 * (heights < 500.0))
     assert refracted(*place, LAT, HEIGHT, humid)[1][0] > 1.1 * refracted(*place, LAT, HEIGHT, AIR)[1][0]
-    with refuses("not-increasing"):
+    with refuses("argument-value"):
         Refractivity(1.0, 7000.0, heights[::-1], heights)

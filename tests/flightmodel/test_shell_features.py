@@ -69,8 +69,8 @@ def test_lines_are_measured_across_and_pale_ones_by_their_rise(tmp_path):
         ("marks.csv", None, "file-missing"),
         ("marks.csv", "station_m,radius_m\n1,2\n1,2\n", "column-missing"),
         ("marks.csv", HEAD + "0.3,0.3,x,dot,darker,0.02\n0.3,0.3,0,dot,darker,0.02\n", "not-a-number"),
-        ("marks.csv", HEAD + "0.3,0.3,0,spot,darker,0.02\n0.3,0.3,0,dot,darker,0.02\n", "feature-word"),
-        ("marks.csv", HEAD + "9.3,0.3,0,dot,darker,0.02\n0.3,0.3,0,dot,darker,0.02\n", "feature-off-shell"),
+        ("marks.csv", HEAD + "0.3,0.3,0,spot,darker,0.02\n0.3,0.3,0,dot,darker,0.02\n", "not-a-number"),
+        ("marks.csv", HEAD + "9.3,0.3,0,dot,darker,0.02\n0.3,0.3,0,dot,darker,0.02\n", "edit-unusable"),
     ],
 )
 def test_what_no_shell_carries_is_refused(tmp_path, features, listed, code):

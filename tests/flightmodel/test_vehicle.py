@@ -106,7 +106,7 @@ def test_three_moments_of_inertia_are_the_diagonal_and_other_forms_are_told(tmp_
 
 
 def test_unknown_vehicle_and_bad_toml(tmp_path):
-    with refuses("vehicle-unknown", names=["'irve2_reference'"], kind=ConfigError):
+    with refuses("name-unknown", names=["'irve2_reference'"], kind=ConfigError):
         vehicle_path("irve2_refrence")
     (tmp_path / "bad.toml").write_text("a = = 1")
     with refuses("toml-syntax", names=["line 1"], kind=ConfigError):
@@ -156,5 +156,5 @@ def test_history_between_and_outside_its_answers():
     history = DeflectionHistory(t, theta, np.zeros(4), np.tile(np.eye(2) * 1e-4, (4, 1, 1)), "camera")
     assert history.at(1.5) == pytest.approx((0.03, 0.01))
     assert np.isnan(history.at(0.5)[0])
-    with refuses("not-increasing"):
+    with refuses("argument-value"):
         DeflectionHistory(t[::-1].copy(), theta, np.zeros(4), None, "camera")

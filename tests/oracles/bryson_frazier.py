@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recon.smoother import Smoothed, full_step, measured_rows, store_moments
+from recon.ekf import full_step, measured_rows
+from recon.smoother import Smoothed, store_moments
 from recon.state import unpacked
 
 

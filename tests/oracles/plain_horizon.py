@@ -46,26 +46,6 @@ def dip_centre(image, origin, across, reach, half_width):
     return centre
 
 
-def share_of_second_edge(steps, by_turn, limits):
-    """The kernel's definition, turn by turn."""
-    nearest, farthest, spacing, least, low = limits
-    size = np.hypot(*by_turn.T).max()
-    middle = steps.shape[1] // 2
-    best = (low, 0.0)
-    for a in range(-int(farthest), int(farthest) + 1):
-        for b in range(-int(farthest), int(farthest) + 1):
-            off = by_turn @ [a / size, b / size]
-            moved = (np.abs(off) >= nearest) & (np.abs(off) <= farthest)
-            if moved.sum() < least:
-                continue
-            at = middle + np.round(off[moved] / spacing).astype(int)
-            beside = np.arange(-2, 3)
-            seen = [row[np.clip(k + beside, 0, len(row) - 1)].any() for row, k in zip(steps[moved], at, strict=True)]
-            if np.mean(seen) > best[0]:
-                best = (float(np.mean(seen)), float(np.hypot(a, b) / size))
-    return best
-
-
 def first_lasting_steps(grey, inside, limits):
     """Sample of each line (n, m) at which its first step from a plain beginning is steepest; NaN without one."""
     (plain, half, least, of_scatter), count = limits, grey.shape[1]
@@ -85,14 +65,3 @@ def first_lasting_steps(grey, inside, limits):
     before, here, after = (slope[rows, at + k] for k in (-1, 0, 1))
     bend = np.minimum(before - 2.0 * here + after, -1e-9)
     return np.where(beyond.any(axis=1), at + np.clip(0.5 * (before - after) / bend, -1.0, 1.0), np.nan)
-
-
-def row_differences(image, tall, wide, step, most):
-    """Mean square differences of rows next to each other, and of every other one, in blocks; mean steps of rows."""
-    few = image[:, ::step].astype(float)
-    steps = np.minimum(np.abs(np.diff(few, axis=0)), most).mean(axis=1)
-    across, down = wide // step, (len(few) - 2) // tall
-    used = image.shape[1] // wide * across
-    near, far = (few[:-2] - few[1:-1]) ** 2, (few[:-2] - few[2:]) ** 2
-    blocks = (part[: down * tall, :used].reshape(down, tall, -1, across).mean(axis=(1, 3)) for part in (near, far))
-    return *blocks, steps

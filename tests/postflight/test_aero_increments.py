@@ -9,14 +9,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from estimators.fusing import CameraTimeBias, fuse_flight
 from estimators.increments import COEFFICIENTS, STATED
 from flightmodel.aerodynamics import read_with_sidecar, referred_to
-from flightmodel.checks import DivergenceError, Fault, GateError
+from flightmodel.checks import DivergenceError, GateError, Issue
 from flightmodel.vehicle import DATA, vehicle_from_toml
 from postflight import flown_coefficients
 from postflight.deflections import Deflections, aero_increments, with_increments
 from postflight.flown_coefficients import TABLE, increments_of
-from postflight.fusing import CameraTimeBias, fuse_flight
 from postflight.plots.deflection import figure_increments
 from postflight.reconstruction import Reconstruction
 from postflight.run_folder import increments_summary
@@ -115,16 +115,16 @@ def test_a_table_that_is_wrong_turns_red_and_is_named(k, name):
 
 def test_answers_carry_increments_or_why_there_are_none():
     bet = object.__new__(Reconstruction)
-    none = Deflections(bet=bet, refused={"fused": Fault("no loads", "loads-missing")})
+    none = Deflections(bet=bet, refused={"fused": Issue("no loads", "input-missing")})
     assert with_increments(none) is none
     assert increments_summary(none) is None
     with pytest.raises(GateError) as refused:
         aero_increments(bet, none)
-    assert refused.value.codes == ("loads-missing",)
+    assert refused.value.codes == ("input-missing",)
     with pytest.raises(GateError) as refused:
         aero_increments(object.__new__(Reconstruction), none)
-    assert refused.value.codes == ("answers-of-another",)
-    why = Fault("they do not settle", "increments-not-converged")
+    assert refused.value.codes == ("argument-value",)
+    why = Issue("they do not settle", "not-converged")
     assert increments_summary(replace(none, no_increments=why))["code"] == why.code
     whole = replace(none, fused=answer(), increments=found())
     assert "aero-increment" in {check.code for check in whole.consistency_checks}
@@ -135,7 +135,7 @@ def test_without_increments_a_late_film_is_said_first(monkeypatch):
     """The reader is sent to the film's time tags, not to the coefficient table alone."""
 
     def unsettled(*_):
-        raise DivergenceError("they do not settle", code="increments-not-converged")
+        raise DivergenceError("they do not settle", code="not-converged")
 
     monkeypatch.setattr(flown_coefficients, "increments_of", unsettled)
     settings = SimpleNamespace(check_confidence=CONFIDENCE)
@@ -143,7 +143,7 @@ def test_without_increments_a_late_film_is_said_first(monkeypatch):
     late, on_time = (CameraTimeBias(offset, 0.01, False) for offset in (1.0, 0.0))
     for bias, first in ((late, late.cause), (on_time, "they do not settle")):
         said = with_increments(Deflections(bet=bet, fused=replace(answer(), camera_time_bias=bias))).no_increments
-        assert said.code == "increments-not-converged"
+        assert said.code == "not-converged"
         assert str(said).startswith(first)
     assert late.cause
 

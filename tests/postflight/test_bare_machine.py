@@ -12,11 +12,10 @@ from tests.refusing import printed_codes
 CACHES = ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR", "MPLCONFIGDIR", "POSTFLIGHT_CACHE")
 # `kernel` compiles; `style` imports what draws
 USE = """
-from flightmodel import _csv_kernels, _kernels
+from flightmodel import _kernels
 import postflight.plots.deflection, postflight.commands as commands
 commands.compile_kernels()
 commands.compile_kernels()
-_csv_kernels.powers_of_five()
 import flightmodel.earth
 print(_kernels.CACHE.path or "none")
 """
@@ -63,7 +62,7 @@ def test_nowhere_to_write_at_all(tmp_path):
 
     Only drawing then fails: matplotlib insists on a folder.
     """
-    refused = "import tempfile\ndef no(**_): raise OSError(30, 'read-only')\ntempfile.mkdtemp = no\n"
+    refused = "import tempfile\ndef no(*_, **__): raise OSError(30, 'read-only')\ntempfile.mkdtemp = no\n"
     (tmp_path / "file").touch()
     code = refused + USE.replace("postflight.plots.deflection, postflight.commands as", "postflight.warmup as")
     code = code.replace("commands.compile_kernels()\n", "commands.prepare((), print)\n")

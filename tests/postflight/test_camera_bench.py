@@ -135,10 +135,10 @@ class TestSession:
     def test_what_cannot_be_meant_changes_nothing(self, session, folder):
         revision = session.state()["revision"]
         for rows, code in (
-            ([edit("reject", t_s=1.0)], "edit-no-frame"),
-            ([edit("rim", t_s=430.0, u_px="x", v_px=3.0)], "edit-unknown"),
-            (["reject"], "edit-unknown"),
-            ([edit("reject", t_s=430.0, note=5)], "edit-unknown"),
+            ([edit("reject", t_s=1.0)], "time-not-covered"),
+            ([edit("rim", t_s=430.0, u_px="x", v_px=3.0)], "edit-unusable"),
+            (["reject"], "edit-unusable"),
+            ([edit("reject", t_s=430.0, note=5)], "edit-unusable"),
         ):
             with pytest.raises(GateError) as refusal:
                 session.save(rows, revision)
@@ -160,7 +160,7 @@ class TestSession:
         cv2.imwrite(str(folder / "film" / "421.png"), np.zeros_like(pictures[0]))
         session = session_of(read_flight(folder, needs_path=False), folder)
         state = session.state()
-        assert state["trouble"]["code"] == "frame-dark"
+        assert state["trouble"]["code"] == "frame-exposure"
         shown = session.frame(2, None, None, np.array([0.0, 0.0, 0.02, 1.0]))
         assert len(shown["outline"]) > 50
         assert len(shown["edge"]) > 50
@@ -169,7 +169,7 @@ class TestSession:
     def test_pictures_of_a_finer_camera_are_read_smaller(self, finer):
         telemetry = read_flight(finer, needs_path=False).telemetry
         frames = telemetry.frames
-        assert [f.code for f in telemetry.findings if f.source == "frames"] == ["pictures-reduced"]
+        assert [f.code for f in telemetry.findings if f.source == "frames"] == ["frame-size"]
         assert frames.picture(1).shape == (480, 720)
         # the reference camera, to rounding: a pixel's middle is at half of the new pixel beside it
         np.testing.assert_allclose(frames.camera.focal_px, (310.0, 310.0))
@@ -270,7 +270,7 @@ class TestServer:
     def test_a_camera_that_is_not_there_is_refused_by_name(self, folder, command):
         done = command("camera", folder, "--no-browser", "--camera", "camra5")
         assert done.returncode == 2
-        assert "camera-unknown" in done.stderr
+        assert "name-unknown" in done.stderr
         assert "camera5" in done.stderr
 
     def test_a_flight_without_video_is_refused_by_name(self, folder, command):

@@ -119,7 +119,7 @@ def test_unknown_source_exits_2_before_anything_is_compiled(command, flight, mon
     monkeypatch.setattr(commands, "compile_kernels", lambda *_: pytest.fail("compiled first"))
     done = command("reconstruct", flight.root, *options)
     assert done.returncode == 2, done.stderr
-    assert printed_codes(done.stderr) == ["source-unknown"]
+    assert printed_codes(done.stderr) == ["name-unknown"]
     assert "'north'" in done.stderr
     assert not (flight.root / "runs").exists()
 
@@ -169,7 +169,7 @@ def test_simulate_without_a_scenario_flies_the_reference(command, tmp_path: Path
     before = tree(tmp_path)
     done = command("simulate", "out", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
-    assert printed_codes(done.stderr) == ["folder-exists"]
+    assert printed_codes(done.stderr) == ["file-exists"]
     assert "out" in done.stderr
     assert tree(tmp_path) == before
 
@@ -438,7 +438,7 @@ def test_score_with_broken_truth_exits_3_without_traceback(command, flight) -> N
     (run / "bet.csv").write_text("t_s\n")
     done = command("score", flight.root)
     assert done.returncode == 3
-    assert printed_codes(done.stderr) == ["table-unreadable"]
+    assert printed_codes(done.stderr) == ["file-unreadable"]
     assert "Traceback" not in done.stderr
 
 

@@ -146,7 +146,7 @@ def test_names_stay_text_in_kml(folder, tmp_path):
     from dataclasses import replace
 
     source = replace(read_source(folder), name="<script>alert(1)</script> & \x00")
-    root = etree.fromstring(exports.FORMS["kml"][0](source))
+    root = etree.fromstring(exports.FORMS["kml"](source))
     assert not root.findall(".//script")
     assert root.find(f".//{KML}name").text.startswith("‹script›")
 
@@ -175,14 +175,13 @@ def test_attitude_that_is_not_known_is_refused(folder):
     """The recorded rocket has no gyros."""
     for form in ("aem", "msopck"):
         with refuses("attitude-missing"):
-            exports.FORMS[form][0](read_source(folder))
+            exports.FORMS[form](read_source(folder))
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "mat", "nc", "kml", "oem"])
 def test_the_same_run_gives_the_same_bytes(form, folder):
     source = read_source(folder)
-    write, suffix = exports.FORMS[form]
-    assert suffix == f".{form}"
+    write = exports.FORMS[form]
     assert write(source) == write(read_source(folder))
 
 
@@ -197,7 +196,7 @@ def test_missing_extra_is_said_with_the_command(folder, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError) as fault:
         exports.export(folder, "parquet", None)
-    assert fault.value.codes == ("library-missing",)
+    assert fault.value.codes == ("package-missing",)
     assert "postflight[parquet]" in str(fault.value)
     assert fault.value.exit_code == 2
     assert not (folder / "exports").exists()
@@ -212,7 +211,7 @@ def test_flight_without_a_run_is_refused(tmp_path):
 def test_run_folders_stay_as_they_are(folder):
     with pytest.raises(ConfigError) as fault:
         exports.export(folder, "csv", folder / "runs" / "x.csv")
-    assert fault.value.codes == ("export-into-run",)
+    assert fault.value.codes == ("file-exists",)
 
 
 def test_summary_says_on_what_the_position_rests(folder):

@@ -78,23 +78,23 @@ def test_a_list_that_disagrees_with_the_film(filmed):
 
 def test_file_names_where_numbers_are_wanted(filmed):
     filmed.cell("frames.csv", 3, 1, "frame_1.png")
-    assert names_line(str(refused(filmed, "frame_1.png", codes={"frame-number"})), 3)
+    assert names_line(str(refused(filmed, "frame_1.png", codes={"frame-missing"})), 3)
 
 
 def test_numbers_that_fall(filmed):
     filmed.cell("frames.csv", 4, 1, "1")
-    assert names_line(str(refused(filmed, codes={"frame-number"})), 4)
+    assert names_line(str(refused(filmed, codes={"frame-missing"})), 4)
 
 
 def test_a_film_of_another_size(filmed):
     write_film(filmed.root / "telemetry/camera5.avi", size=(640, 480))
-    refused(filmed, "640 x 480", "720 x 480", codes={"image-size"})
+    refused(filmed, "640 x 480", "720 x 480", codes={"frame-size"})
 
 
 @pytest.mark.parametrize("content", [b"", b"RIFF but no film", b"\0" * 4096])
 def test_a_film_that_is_none(filmed, content):
     (filmed.root / "telemetry/camera5.avi").write_bytes(content)
-    refused(filmed, "camera5.avi", codes={"film-unreadable", "file-empty"})
+    refused(filmed, "camera5.avi", codes={"file-unreadable"})
 
 
 def test_a_truncated_film_loses_its_end_alone(filmed):
@@ -109,14 +109,14 @@ def test_a_film_that_is_missing_and_one_outside(filmed):
     (filmed.root / "telemetry/camera5.avi").unlink()
     refused(filmed, "camera5.avi", codes={"file-missing"})
     filmed.replace("flight.toml", "telemetry/camera5.avi", "../elsewhere.avi")
-    refused(filmed, "elsewhere.avi", codes={"path-outside-folder"})
+    refused(filmed, "elsewhere.avi", codes={"path-refused"})
 
 
 def test_folder_and_film_together_or_neither(filmed):
     filmed.declare('folder = "telemetry/camera5"', 'film = "telemetry/camera5.avi"')
-    refused(filmed, "frames", codes={"frames-source"})
+    refused(filmed, "frames", codes={"keys-conflict"})
     filmed.replace("flight.toml", 'film = "telemetry/camera5.avi"\nfolder = "telemetry/camera5"\n', "")
-    refused(filmed, "frames", codes={"frames-source"})
+    refused(filmed, "frames", codes={"keys-conflict"})
 
 
 def test_a_cut_mp4_says_so(filmed):
@@ -124,14 +124,14 @@ def test_a_cut_mp4_says_so(filmed):
     filmed.replace("flight.toml", "camera5.avi", "camera5.mp4")
     film = filmed.root / "telemetry/camera5.mp4"
     film.write_bytes(film.read_bytes()[: film.stat().st_size // 2])
-    refused(filmed, "camera5.mp4", codes={"film-unreadable"})
+    refused(filmed, "camera5.mp4", codes={"file-unreadable"})
 
 
 def test_one_picture_for_many_times_is_found(filmed):
     for line in (3, 4):
         filmed.cell("frames.csv", line, 1, "0")
     found = [f for f in read_flight(filmed.root).findings if f.source == "frames"]
-    assert [numbers_in(f.what)[:2] for f in found if f.code == "frame-repeated"] == [[2.0, 3.0]]
+    assert [numbers_in(f.what)[:2] for f in found if f.code == "frame-frozen"] == [[2.0, 3.0]]
 
 
 def test_the_command_tells_what_the_gate_found_about_a_film(filmed, command):
@@ -139,7 +139,7 @@ def test_the_command_tells_what_the_gate_found_about_a_film(filmed, command):
     film.write_bytes(film.read_bytes()[: film.stat().st_size * 2 // 3])
     done = command("deflection", filmed.root, "--method", "camera", "--plane", "153", "--film")
     assert done.returncode == 4
-    assert {"film-count", "film-not-drawn"} <= set(printed_codes(done.stdout))
+    assert {"film-count", "figure-failed"} <= set(printed_codes(done.stdout))
     assert not list(filmed.root.rglob("*.webm"))
 
 
@@ -236,8 +236,8 @@ def test_a_benchmark_frame_alone_is_no_answer(flight, command):
         cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), straight if k == 0 else 0 * straight)
     done = command("deflection", flight.root, "--method", "camera", "--plane", "153", "--film")
     assert done.returncode == 4
-    assert {"camera-no-frame", "film-not-drawn"} <= set(printed_codes(done.stdout))
-    (line,) = [line for line in done.stdout.splitlines() if printed_codes(line) == ["camera-no-frame"]]
+    assert {"too-few-data", "figure-failed"} <= set(printed_codes(done.stdout))
+    (line,) = [line for line in done.stdout.splitlines() if printed_codes(line) == ["too-few-data"]]
     assert {2.0, 424.0, 428.5} <= set(numbers_in(line))
     assert not list(flight.root.rglob("*.webm"))
 
@@ -249,4 +249,4 @@ def test_check_does_not_try_a_film_that_is_refused(filmed, command):
     done = command("check", filmed.root)
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
-    assert "film-unreadable" in done.stdout + done.stderr
+    assert "file-unreadable" in done.stdout + done.stderr

@@ -118,7 +118,7 @@ def test_a_number_where_a_folder_is_wanted_is_refused(call):
 def test_a_seed_that_is_none_is_refused(seed):
     with pytest.raises(ConfigError) as fault:
         pf.simulate("irve2_reference", seed=seed)
-    assert fault.value.codes == ("option-value",)
+    assert fault.value.codes == ("value-range",)
 
 
 @pytest.mark.parametrize("call", [pf.read_vehicle, pf.read_scenario, pf.simulate])
@@ -144,7 +144,7 @@ def test_a_wrong_vehicle_puts_every_answer_in_doubt_at_once(flight, bet, answer,
     """Another vehicle's mass: checks of the air are red, and the first words of repr and command say so."""
     assert answer.doubt == ""
     heavy = reconstruction_from(flight.with_(mass_kg=1.8 * flight.vehicle.mass_kg), bet.solution)
-    assert "pre-flight-ca" in {check.code for check in heavy.consistency_checks if not check.passed}
+    assert "pre-flight-drag" in {check.code for check in heavy.consistency_checks if not check.passed}
     assert heavy.suspects[0].sources == ("vehicle", "atmosphere")
     doubtful = replace(answer, bet=heavy)
     assert repr(doubtful).removeprefix("<Deflections: ").startswith(doubtful.doubt)
@@ -240,7 +240,7 @@ def test_a_shift_of_the_cg_is_the_whole_vehicles(flight):
 def test_every_fault_of_a_what_if_is_named_at_once(flight):
     with pytest.raises(ConfigError) as refusal:
         flight.with_(cn=1.1, mass_kg="heavy", density=-1.0, engine="steam", cg_shift_body_m=(0.0, 1.0))
-    assert refusal.value.codes[:3] == ("what-if-unknown", "what-if-value", "what-if-value")
+    assert refusal.value.codes[:3] == ("name-unknown", "value-range", "value-range")
     assert len(refusal.value.faults) == 5
     assert "c_n" in refusal.value.faults[0]
 
@@ -249,7 +249,7 @@ def test_a_source_to_leave_out_is_one_of_the_flights(flight):
     there = next(iter(flight.telemetry.radars))
     with pytest.raises(pf.GateError) as refusal:
         flight.with_(without=("radar9", there), cn=1.1)
-    assert refusal.value.codes == ("what-if-unknown", "source-unknown")
+    assert refusal.value.codes == ("name-unknown", "name-unknown")
     assert "'radar9'" in refusal.value.faults[1]
     assert there in refusal.value.faults[1]
 
@@ -258,7 +258,7 @@ def test_a_source_to_leave_out_is_one_of_the_flights(flight):
 def test_a_study_of_no_flights_is_refused_before_its_folder_is_made(tmp_path, wrong):
     with pytest.raises(pf.GateError) as refusal:
         pf.monte_carlo("irve2_reference", tmp_path / "study", **wrong)
-    assert refusal.value.codes == ("option-value",)
+    assert refusal.value.codes == ("value-range",)
     assert not (tmp_path / "study").exists()
 
 
@@ -297,10 +297,10 @@ def test_a_command_leaves_out_more_and_writes_at_another_rate_without_a_what_if(
     assert commands.asked((f"without={first}",), (second,), None).of(flight).settings.without == (first, second)
     with pytest.raises(ConfigError) as refusal:
         commands.asked(("c_n", "=1"), (), None)
-    assert refusal.value.codes == ("set-form", "set-form")
+    assert refusal.value.codes == ("option-format", "option-format")
     with pytest.raises(ConfigError) as refusal:  # with_(c_n=1.2, c_n=1.0) is no Python either
         commands.asked(("c_n=1.2", "wind=none", "c_n=1.0"), (), None)
-    assert refusal.value.codes == ("set-twice",)
+    assert refusal.value.codes == ("given-twice",)
     assert "c_n" in str(refusal.value)
 
 
@@ -342,13 +342,13 @@ def test_a_change_that_replaces_another_is_named_alone(flight):
 def test_what_lies_outside_the_vehicle_is_refused(flight, changes):
     with pytest.raises(ConfigError) as refusal:
         flight.with_(**changes)
-    assert refusal.value.codes == ("what-if-outside",)
+    assert refusal.value.codes == ("value-range",)
 
 
 def test_a_word_for_a_shift_is_refused(flight):
     with pytest.raises(ConfigError) as refusal:
         flight.with_(cg_shift_body_m="aft")
-    assert refusal.value.codes == ("what-if-value",)
+    assert refusal.value.codes == ("value-range",)
 
 
 def test_a_run_is_chosen_by_name_digits_or_folder(tmp_path, monkeypatch):
@@ -372,7 +372,7 @@ def test_a_run_is_chosen_by_name_digits_or_folder(tmp_path, monkeypatch):
             call(tmp_path / "flight", run)
         assert asked == [*[there[1]] * 4, *[there[0]] * 2, None]
         asked.clear()
-        for run, code in ((joint, "run-incomplete"), (tmp_path, "run-of-another"), ("cold", "run-unknown")):
+        for run, code in ((joint, "run-incomplete"), (tmp_path, "run-missing"), ("cold", "name-unknown")):
             with pytest.raises(pf.GateError) as fault:
                 call(tmp_path / "flight", run)
             assert fault.value.codes == (code,)

@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from estimators import fusing
 from estimators.agreement import OFFSET
 from estimators.evidence import moved_vehicle
+from estimators.fusing import _mixed, fuse_flight
 from estimators.fusion import fuse
-from flightmodel.checks import DivergenceError, Fault
+from flightmodel.checks import Check, DivergenceError, Issue
 from flightmodel.deflection import UNIFORM_VAR, DeflectionHistory, history_from_lateral
-from postflight import fusing
 from postflight.deflections import Deflections, borne_out, quantiles_at
-from postflight.fusing import _mixed, fuse_flight
-from recon.consistency import ConsistencyCheck
 from tests.estimators.conftest import VEHICLE, pulse_of
 
 N = 160
@@ -38,7 +37,7 @@ def sound(vehicle=VEHICLE):
 
 def error_sd(answer):
     """Error at the middle along the deflection, over its sd, and that sd, deg."""
-    history = answer.fused.history
+    history = answer.history
     k = int(np.argmin(np.abs(history.time_s - TIME_S[K])))
     off = history.theta_rad[k] - np.linalg.norm(motion()[K])
     return off / history.theta_sd_rad[k], np.rad2deg(history.theta_sd_rad[k])
@@ -83,7 +82,7 @@ def test_a_film_that_is_early_by_most_of_a_period_has_its_time_bias():
 def test_a_time_bias_is_found_without_the_trim_where_all_methods_have_no_answer(monkeypatch):
     def diverging(read, **kwargs):
         if any(e.method == "trim" for e in read({}, None)):
-            raise DivergenceError("it still moves", code="fusion-not-converged")
+            raise DivergenceError("it still moves", code="not-converged")
         return fuse(read, **kwargs)
 
     monkeypatch.setattr(fusing, "fuse", diverging)
@@ -95,7 +94,7 @@ def test_a_film_carries_the_answer_through_a_gap_of_the_sensors():
     loads = sound()
     gap = TIME_S[K] + np.array([-1.5, 1.5])
     loads = loads.rows((loads.time_s < gap[0]) | (loads.time_s > gap[1]))
-    filmed, without = (fuse_flight(loads, f).fused.history for f in (film(motion()), None))
+    filmed, without = (fuse_flight(loads, f).history for f in (film(motion()), None))
     inside = (filmed.time_s > gap[0]) & (filmed.time_s < gap[1])
     assert np.diff(filmed.time_s).max() < 0.06
     off = filmed.theta_rad[inside] - np.linalg.norm(motion(filmed.time_s[inside]), axis=1)
@@ -145,8 +144,8 @@ def test_a_deflection_of_25_deg_is_fused_as_well_as_read():
     bent = 6.0 * motion()
     loads = replace(pulse_of(np.random.default_rng(3), N, bent, stable)[0], vehicle=stable)
     answer = fuse_flight(loads, None)
-    at = np.searchsorted(TIME_S, answer.fused.history.time_s)
-    off = np.linalg.norm(answer.fused.history.theta_yz_rad - bent[at], axis=1)[10:-10]
+    at = np.searchsorted(TIME_S, answer.history.time_s)
+    off = np.linalg.norm(answer.history.theta_yz_rad - bent[at], axis=1)[10:-10]
     assert np.rad2deg(np.linalg.norm(bent, axis=1).max()) > 24.0
     # data in static trim of a deflection that moves: what the motion weighs is left
     assert np.rad2deg(off.max()) < 0.3
@@ -174,17 +173,17 @@ def test_quantiles_between_frames_are_as_wide_as_the_sd():
 
 
 def test_a_refused_fusion_is_a_red_check():
-    refused = Deflections(refused={"fused": Fault("no common answer", "fusion-not-converged")})
+    refused = Deflections(refused={"fused": Issue("no common answer", "not-converged")})
     (check,) = refused.consistency_checks
     assert not check.passed
     assert check.code == "deflection-methods"
     # one that has nothing to say is none
-    assert Deflections(refused={"fused": Fault("no vehicle", "vehicle-missing")}).consistency_checks == ()
+    assert Deflections(refused={"fused": Issue("no vehicle", "vehicle-missing")}).consistency_checks == ()
     assert Deflections().consistency_checks == ()
 
 
 def test_features_that_a_film_lacks_are_no_fault_where_the_inertial_methods_bear_it_out():
-    lacking = ConsistencyCheck("camera-features", "stated features", 1.0, 0.0, 0.0, False, "not found", "camera")
+    lacking = Check("camera-features", "stated features", 1.0, 0.0, 0.0, False, "not found", "camera")
     assert borne_out(lacking, fuse_flight(sound(), film(motion())).agreement).passed
     assert not borne_out(lacking, fuse_flight(sound(), None).agreement).passed
     for spoilt in SPOILT.values():
@@ -208,14 +207,14 @@ def test_two_methods_that_contradict_are_spanned_by_the_mixture_of_each_alone():
 
 def test_a_mixture_of_histories_whose_planes_are_all_lost_is_as_well_known_across_as_along():
     answer = fuse_flight(sound(), None)
-    times = answer.fused.history.time_s
+    times = answer.history.time_s
     unknown = np.zeros((len(times), 2, 2))
     unknown[:, 0, 0], unknown[:, 1, 1] = np.deg2rad(0.3) ** 2, UNIFORM_VAR
     lost = {
         name: DeflectionHistory(times, np.full(len(times), np.deg2rad(size)), np.zeros(len(times)), unknown, name, "")
         for name, size in (("one", 0.1), ("other", 0.5))
     }
-    mixed = _mixed(answer, lost, np.ones(2), sound()).fused.history
+    mixed = _mixed(answer, lost, np.ones(2), sound()).history
     # same planes: 0.3 deg of each, and their sizes 0.2 deg on either side of the mean
     expected = np.deg2rad([[np.hypot(0.3, 0.2), 0.0], [0.0, 0.3]]) ** 2
     np.testing.assert_allclose(mixed.theta_rad, np.deg2rad(0.3))

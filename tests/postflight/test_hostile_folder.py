@@ -75,7 +75,7 @@ def test_what_is_no_file_is_refused_and_not_waited_for(with_vehicle, name, spoil
     done = check(with_vehicle.root)
     assert done.returncode in (2, 3)
     assert "Traceback" not in done.stderr
-    inside = "not-a-file" if spoil is not endless or name in ("flight.toml", "vehicle.toml") else "path-outside-folder"
+    inside = "not-a-file" if spoil is not endless or name in ("flight.toml", "vehicle.toml") else "path-refused"
     assert inside in printed_codes(done.stdout + done.stderr), done.stdout + done.stderr
     assert path.name in done.stdout + done.stderr
 
@@ -98,7 +98,7 @@ def test_a_file_beside_the_vehicle_that_is_a_link_out(with_vehicle, name):
     secret.write_text("password = of somebody\n")
     (with_vehicle.root / name).unlink()
     (with_vehicle.root / name).symlink_to(secret)
-    with refuses("path-outside-folder", names=[name], kind=ConfigError) as caught:
+    with refuses("path-refused", names=[name], kind=ConfigError) as caught:
         read_flight(with_vehicle.root)
     assert "password" not in str(caught.value)
 
@@ -118,7 +118,7 @@ def test_truth_by_a_hard_link_is_refused(flight):
     shutil.copyfile(flight.path("rates.csv"), truth / "rates.csv")
     flight.path("rates.csv").unlink()
     os.link(truth / "rates.csv", flight.path("rates.csv"))
-    with refuses("path-in-truth", names=["rates.csv"]):
+    with refuses("path-refused", names=["rates.csv"]):
         read_flight(flight.root)
 
 
@@ -134,7 +134,7 @@ def test_a_vehicle_from_the_truth_is_refused(with_vehicle):
     for name in ("vehicle.toml", "aero.csv", "aero.toml"):
         shutil.move(with_vehicle.root / name, with_vehicle.root / "truth" / name)
     with_vehicle.replace("flight.toml", '"vehicle.toml"', '"truth/vehicle.toml"')
-    with refuses("path-in-truth", kind=ConfigError):
+    with refuses("path-refused", kind=ConfigError):
         read_flight(with_vehicle.root)
 
 
@@ -161,7 +161,7 @@ def test_a_vehicle_file_of_its_table_s_name_is_one_fault(with_vehicle):
     (root / "aero.csv").rename(root / "vehicle.csv")
     text = (root / "vehicle.toml").read_text()
     (root / "vehicle.toml").write_text(text.replace('"aero.csv"', '"vehicle.csv"'))
-    with refuses("sidecar-is-vehicle", names=["vehicle.csv"], kind=ConfigError) as caught:
+    with refuses("keys-conflict", names=["vehicle.csv"], kind=ConfigError) as caught:
         read_flight(root)
     assert len(caught.value.faults) == 1
 

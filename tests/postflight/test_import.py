@@ -170,7 +170,7 @@ def test_matlab_73_is_read_or_refused_with_the_extra(folder, tables, tmp_path, m
     path.rename(tmp_path / "again.mat")
     with pytest.raises(ConfigError) as refusal:
         run("import", tmp_path / "again.mat", "--into", folder)
-    assert refusal.value.codes == ("h5py-missing",)
+    assert refusal.value.codes == ("package-missing",)
     assert "postflight[matlab]" in str(refusal.value)
 
 
@@ -268,7 +268,7 @@ def test_nothing_is_overwritten_and_no_half_import_is_left(folder, tmp_path):
     before = text_of(folder)
     with pytest.raises(GateError) as refusal:
         run("import", tmp_path / "one.csv", tmp_path / "bad.csv", "--into", folder)
-    assert refusal.value.codes == ("table-missing",)
+    assert refusal.value.codes == ("file-unreadable",)
     assert text_of(folder) == before
     assert not list((folder / "telemetry").iterdir())
     run("import", tmp_path / "one.csv", "--into", folder)
@@ -291,8 +291,8 @@ def test_hostile_names_stay_text(folder, tmp_path):
 @pytest.mark.parametrize(
     ("content", "code"),
     [
-        (b"nothing\nhere\n", "table-missing"),
-        (b"\0\1\2" * 50, "table-binary"),
+        (b"nothing\nhere\n", "file-unreadable"),
+        (b"\0\1\2" * 50, "file-unreadable"),
         (None, "file-missing"),
     ],
 )
@@ -308,10 +308,10 @@ def test_damaged_matlab_files_and_folders_without_a_flight_are_refused_with_thei
     (tmp_path / "bad.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(200))
     with pytest.raises(GateError) as refusal:
         run("import", tmp_path / "bad.mat", "--into", folder)
-    assert refusal.value.codes == ("matlab-unreadable",)
+    assert refusal.value.codes == ("file-unreadable",)
     with pytest.raises(ConfigError) as refusal:
         run("import", tmp_path / "bad.mat", "--into", tmp_path / "elsewhere")
-    assert refusal.value.codes == ("flight-file-missing",)
+    assert refusal.value.codes == ("file-missing",)
 
 
 # recorded flights, whose own flight.toml is the answer

@@ -159,13 +159,17 @@ def test_what_is_no_data_is_named_and_left_out(folder, tmp_path):
     out = run("import", *sorted(delivery.iterdir()), "--into", folder).output
     left_out = {code: line for line in out.splitlines() for code in printed_codes(line)}
     assert len(left_out) == len(printed_codes(out)) == 3
-    for name, code in (("notes", "nothing-to-import"), ("MEMO.txt", "table-missing"), ("index.txt", "no-picture")):
+    for name, code in (
+        ("notes", "nothing-to-import"),
+        ("MEMO.txt", "file-unreadable"),
+        ("index.txt", "nothing-to-import"),
+    ):
         assert name in left_out[code]
     assert sorted(p.name for p in (folder / "telemetry").iterdir()) == ["cam", "radar.csv"]
     assert sorted(p.suffix for p in (folder / "telemetry" / "cam").iterdir()) == [".png"] * 5
     with pytest.raises(GateError) as refusal:
         run("import", delivery / "MEMO.txt", "--into", folder)
-    assert refusal.value.codes == ("table-missing",)
+    assert refusal.value.codes == ("file-unreadable",)
     with pytest.raises(GateError) as refusal:
         run("import", delivery / "notes", "--into", folder)
     assert refusal.value.codes == ("nothing-to-import",)
@@ -244,5 +248,5 @@ def test_a_film_that_is_none_is_refused_before_it_is_copied(folder, tmp_path):
     (tmp_path / "none.webm").touch()
     with pytest.raises(GateError) as refusal:
         run("import", tmp_path / "film.mp4", tmp_path / "none.webm", "--into", folder)
-    assert refusal.value.codes == ("film-unreadable", "file-empty")
+    assert refusal.value.codes == ("file-unreadable", "file-unreadable")
     assert not list((folder / "telemetry").glob("*"))

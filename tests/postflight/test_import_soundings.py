@@ -62,7 +62,7 @@ def wyoming(path):
 
 def test_wyoming_list(folder, tmp_path):
     s, codes, output = brought_in(folder, wyoming(tmp_path / "wal.txt"))
-    assert "wind-direction-converted" in codes
+    assert "values-converted" in codes
     assert re.search(r"\b0 levels\b", output)  # none is left out
     # a knot is 0.5144 m/s; from 30 deg the air goes to 210 deg
     assert s.wind_north_mps[0] == pytest.approx(-14 * 0.514444 * np.cos(np.deg2rad(30)), rel=1e-5)
@@ -87,7 +87,7 @@ def test_wind_by_components_of_where_it_goes(folder, tmp_path):
     table = table.assign(density_kgpm3=1.2 * np.exp(-table.alt_km / 7.2), temp_K=250.0, u_mps=5.0, v_mps=-3.0)
     table.to_csv(tmp_path / "rocketsonde.csv", index=False)
     s, codes, _ = brought_in(folder, tmp_path / "rocketsonde.csv")
-    assert "wind-direction-converted" not in codes
+    assert "values-converted" not in codes
     assert (s.wind_east_mps == 5.0).all()
     assert (s.wind_north_mps == -3.0).all()
 
@@ -96,7 +96,7 @@ def test_delivered_composite_is_declared_as_it_stands(folder):
     s, codes, _ = brought_in(folder, PACKAGE / "met_composite.csv")
     delivered = pd.read_csv(PACKAGE / "met_composite.csv")
     np.testing.assert_array_equal(s.density_kgpm3, delivered["DENSITY (kg/m3)"])
-    assert "wind-direction-converted" in codes
+    assert "values-converted" in codes
     assert (folder / "telemetry" / "met_composite.csv").read_bytes() == (PACKAGE / "met_composite.csv").read_bytes()
 
 
@@ -119,7 +119,7 @@ def test_rocketsonde_with_german_names_and_a_time_column(folder, tmp_path):
 def test_radiosondes(name, folder):
     path = Path(str(REAL)) / "soundings" / f"{name}.csv"
     s, codes, _ = brought_in(folder, path)
-    assert "wind-direction-converted" in codes
+    assert "values-converted" in codes
     table = pd.read_csv(path)
     # the station's own components say where the air goes
     wind = table[table.from_deg.notna() & table.h_m.between(500, 16000)]

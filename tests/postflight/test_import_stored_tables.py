@@ -124,18 +124,18 @@ def test_a_spreadsheet_without_the_library_is_refused_with_the_extra(folder, tmp
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     with pytest.raises(ConfigError) as refusal:
         brought_in(folder, workbook_by_hand(tmp_path / "a.xlsx"))
-    assert refusal.value.codes == ("library-missing",)
+    assert refusal.value.codes == ("package-missing",)
     assert "postflight[excel]" in str(refusal.value)
     assert not list((folder / "telemetry").iterdir())
 
 
 def test_damaged_and_old_files_are_refused_by_name(folder, tmp_path):
     files = {
-        "old.xls": (b"\xd0\xcf\x11\xe0" + bytes(600), "table-old-excel"),
-        "cut.parquet": (b"PAR1" + bytes(50), "table-unreadable"),
-        "cut.nc": (b"CDF\x01" + bytes(5), "table-unreadable"),
-        "new.nc": (b"CDF\x05" + bytes(50), "table-unreadable"),
-        "cut.h5": (b"\x89HDF\r\n\x1a\n" + bytes(40), "table-unreadable"),
+        "old.xls": (b"\xd0\xcf\x11\xe0" + bytes(600), "file-unreadable"),
+        "cut.parquet": (b"PAR1" + bytes(50), "file-unreadable"),
+        "cut.nc": (b"CDF\x01" + bytes(5), "file-unreadable"),
+        "new.nc": (b"CDF\x05" + bytes(50), "file-unreadable"),
+        "cut.h5": (b"\x89HDF\r\n\x1a\n" + bytes(40), "file-unreadable"),
     }
     for name, (content, _) in files.items():
         (tmp_path / name).write_bytes(content)
@@ -176,7 +176,7 @@ def test_parquet_without_the_library_is_refused_with_the_extra(folder, tmp_path,
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ConfigError) as refusal:
         brought_in(folder, tmp_path / "a.parquet")
-    assert refusal.value.codes == ("library-missing",)
+    assert refusal.value.codes == ("package-missing",)
     assert "postflight[parquet]" in str(refusal.value)
 
 
@@ -395,7 +395,7 @@ def test_a_sounding_that_is_not_whole_is_named_and_never_a_barometer(folder, tmp
     (tmp_path / "met.csv").write_text("\n".join([names.replace("_furlong", " (zorks)"), *rows]) + "\n")
     tables, output = brought_in(folder, tmp_path / "met.csv", code=3)
     assert not {"gnss", "barometers", "atmosphere"} & set(tables)
-    assert "sounding-incomplete" in printed_codes(output)
+    assert "column-missing" in printed_codes(output)
     assert "pressure (zorks)" in output
 
 
@@ -415,11 +415,11 @@ def test_what_is_not_used_is_named_and_the_exit_code_says_so(folder, tmp_path):
     assert list(tables["radars"]) == ["good"]
     assert tables["atmosphere"]["file"] == "telemetry/morning.csv"
     left_out = {code: line for line in output.splitlines() for code in printed_codes(line)}
-    assert set(left_out) == {"table-missing", "not-recognised", "second-of-its-kind"}
+    assert set(left_out) == {"file-unreadable", "column-missing", "given-twice"}
     for code, name in (
-        ("table-missing", "README.txt"),
-        ("not-recognised", "odd.csv"),
-        ("second-of-its-kind", "noon.csv"),
+        ("file-unreadable", "README.txt"),
+        ("column-missing", "odd.csv"),
+        ("given-twice", "noon.csv"),
     ):
         assert name in left_out[code]
 
@@ -438,5 +438,5 @@ def test_a_file_that_kills_or_holds_its_library_is_refused(tmp_path, monkeypatch
     savemat(tmp_path / "track.mat", {"time": T, "range": RANGE_M})
     monkeypatch.setitem(stored_tables._READ_THROUGH, "MATLAB", fate)
     monkeypatch.setattr(stored_tables, "_READ_S", 0.5)
-    with refuses("table-unreadable", names=["MATLAB", "checksum"]):
+    with refuses("file-unreadable", names=["MATLAB", "checksum"]):
         stored_tables.read_tables(tmp_path / "track.mat")

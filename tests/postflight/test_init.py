@@ -180,7 +180,7 @@ def test_nothing_is_overwritten(tmp_path):
 
 def test_unknown_vehicle_is_refused_with_the_nearest(tmp_path):
     made = run("init", tmp_path / "x", "--vehicle", "irve2_referenc")
-    assert made.exception.codes == ("vehicle-unknown",)
+    assert made.exception.codes == ("name-unknown",)
     assert "'irve2_reference'" in str(made.exception)
     assert not (tmp_path / "x").exists()
 

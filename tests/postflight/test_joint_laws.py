@@ -1,4 +1,4 @@
-"""Parts of the reconciliation without a flight: deflection with freeplay, and both samplers on known densities."""
+"""Parts of the reconciliation without a flight: deflection with freeplay, and the sampler on a known density."""
 
 from __future__ import annotations
 
@@ -61,13 +61,6 @@ def test_the_walkers_sample_a_known_density_and_alike_every_time():
     assert np.cov(chain.T) == pytest.approx(COVARIANCE, abs=5.0 / np.sqrt(independent))
 
 
-def test_nested_sampling_finds_a_known_volume():
-    pytest.importorskip("dynesty")
-    volume, sd = posterior._volume(gaussian, 2)
-    true = np.log(2.0 * np.pi * np.sqrt(np.linalg.det(COVARIANCE)))
-    assert abs(volume - true) < 4.0 * sd < 0.8
-
-
 def test_quantities_are_the_vehicles():
     parameters = VehicleParameters(NOMINAL, ("freeplay", "hardening"))
     x = np.zeros((2, len(parameters.names)))
@@ -116,10 +109,10 @@ def test_creep_is_two_parameters_and_two_numbers_of_every_motion():
     )
 
 
-def test_missing_samplers_are_refused(monkeypatch):
-    monkeypatch.setattr(posterior, "find_spec", lambda name: None if name == "emcee" else object())
+def test_a_missing_sampler_is_refused(monkeypatch):
+    monkeypatch.setattr(posterior, "find_spec", lambda name: None)
     with refuses("package-missing", names=["emcee", r"postflight\[posterior\]"], kind=ConfigError):
-        posterior.require_samplers()
+        posterior.require_sampler()
 
 
 def test_knots_carry_gusts_at_the_joints_own_period_and_leave_the_rest_to_the_noise():

@@ -89,12 +89,12 @@ def test_neither_is_needed(clean_flight):
 )
 def test_wrong_column_names_the_nearest(equipped, name, known, wrong):
     equipped.header(name, known, wrong)
-    refused(equipped, "table-column-missing", names=[name, "line 1", f"'{known}'", f"'{wrong}'"])
+    refused(equipped, "column-missing", names=[name, "line 1", f"'{known}'", f"'{wrong}'"])
 
 
 def test_column_without_unit_is_refused_with_how_to_declare_it(equipped):
     equipped.header("magnetometer.csv", "bx_magnetometer_ut", "bx")
-    refused(equipped, "table-column-missing", names=[r"sensors\.magnetometer", r"columns\.bx = { column"])
+    refused(equipped, "column-missing", names=[r"sensors\.magnetometer", r"columns\.bx = { column"])
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("nt", 1e3), ("gauss", 1e-2), ("t", 1e-6)])
@@ -135,12 +135,12 @@ def test_rows_that_come_twice_or_late_are_findings(equipped, name):
     after = read_flight(equipped.root)
     np.testing.assert_array_equal(after.magnetometer.measured_sensor, before.magnetometer.measured_sensor)
     np.testing.assert_array_equal(after.sun.az_el_head_rad, before.sun.az_el_head_rad)
-    assert findings(equipped, name) == [("rows-reordered", 422.0), ("rows-repeated", 420.0)]
+    assert findings(equipped, name) == [("rows-reordered", 422.0), ("rows-left-out", 420.0)]
 
 
 def test_mount_that_the_vehicle_lacks(equipped):
     equipped.declare('mount = "magnetometre"', 'file = "telemetry/magnetometer.csv"')
-    refused(equipped, "mount-unknown", names=[r"sensors\.magnetometer\.mount", "'magnetometer'"], kind=ConfigError)
+    refused(equipped, "name-unknown", names=[r"sensors\.magnetometer\.mount", "'magnetometer'"], kind=ConfigError)
 
 
 def test_misspelt_key_names_the_nearest(equipped):
@@ -152,7 +152,7 @@ def test_all_faults_come_at_once(equipped):
     equipped.header("magnetometer.csv", "by_magnetometer_ut", "by_wrong_ut")
     equipped.cell("sun.csv", 4, 2, "bright")
     equipped.cell("rates.csv", 5, 1, "fast")
-    refused(equipped, "table-column-missing", "not-a-number", names=["by_magnetometer_ut", "'bright'", "'fast'"])
+    refused(equipped, "column-missing", "not-a-number", names=["by_magnetometer_ut", "'bright'", "'fast'"])
 
 
 def test_gap_frozen_and_saturated_runs_are_findings(equipped):
@@ -162,7 +162,7 @@ def test_gap_frozen_and_saturated_runs_are_findings(equipped):
         equipped.cell("magnetometer.csv", line, 2, "11.111")
     for line in range(20, 27):
         equipped.cell("magnetometer.csv", line, 1, "60.0")
-    by_code = {f.code: str(f) for f in read_flight(equipped.root).findings if f.source == "magnetometer"}
+    by_code = {f.code: f.line for f in read_flight(equipped.root).findings if f.source == "magnetometer"}
     assert set(by_code) == {"data-gap", "data-frozen", "data-saturated"}
     assert 0.75 in numbers_in(by_code["data-gap"])
     assert re.search(r"\bby\b.*\b21\b", by_code["data-frozen"])
@@ -189,11 +189,11 @@ def test_empty_sensors_are_refused(equipped):
         equipped.map_column("magnetometer.csv", column, lambda _: "")
     for column in range(1, 9):
         equipped.map_column("sun.csv", column, lambda _: "")
-    refused(equipped, "no-samples", names=[r"sensors\.magnetometer", r"sensors\.sun"])
+    refused(equipped, "too-few-rows", names=[r"sensors\.magnetometer", r"sensors\.sun"])
 
 
 def test_number_of_heads_is_that_of_flight_toml(equipped):
     equipped.replace("flight.toml", "[45.0, 135.0, 225.0, 315.0]", "[45.0, 135.0, 225.0, 270.0, 315.0]")
-    refused(equipped, "table-column-missing", names=["'az_sun5_deg'"])
+    refused(equipped, "column-missing", names=["'az_sun5_deg'"])
     equipped.replace("flight.toml", "[45.0, 135.0, 225.0, 270.0, 315.0]", "[45.0, 135.0]")
     assert read_flight(equipped.root).sun.az_el_head_rad.shape == (200, 2, 2)

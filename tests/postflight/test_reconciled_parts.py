@@ -306,7 +306,7 @@ def fit_with(vehicle=0.0, cost=900.0, spans=1.0, converged=True, creep=1.0, by_s
         ({"cost": 1.3 * 597.0}, "joint-residuals"),
         ({"vehicle": 1.1 * MOST_MOVED_SD}, "joint-moves"),
         ({"spans": 12.0}, "joint-spans"),
-        ({"converged": False}, "joint-converged"),
+        ({"converged": False}, "not-converged"),
         ({"by_steps": 0.6}, "joint-steps"),
         ({"creep": 4.5}, "joint-creep"),
     ],
@@ -349,7 +349,7 @@ def test_a_table_moved_at_a_knot_is_that_of_the_moved_differences():
     for knot in (0, 1, len(warm) // 2, len(warm) - 1):
         moved = warm.copy()
         moved[knot] += 0.1
-        rows = air.warmed_rows(table, knot, 0.1)
+        rows = air.moved_rows(table, 3, knot, 0.1)
         np.testing.assert_allclose(with_rows(table, rows), air.table(difference, moved), rtol=1e-13, atol=1e-12)
         assert not np.array_equal(air.table(difference, moved), table)
 

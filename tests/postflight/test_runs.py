@@ -48,7 +48,7 @@ def flown(tmp_path_factory):
 def test_names_that_are_no_part_of_a_folder_name_are_refused(name):
     with pytest.raises(ConfigError) as fault:
         check_name(name)
-    assert fault.value.codes == ("run-name",)
+    assert fault.value.codes == ("option-format",)
 
 
 def test_a_run_is_found_by_each_of_its_names(flown):
@@ -61,7 +61,7 @@ def test_a_run_is_found_by_each_of_its_names(flown):
         assert find_run(flown, word) == plain
     with pytest.raises(GateError) as fault:
         find_run(flown, "dense-aire")
-    assert fault.value.codes == ("run-unknown",)
+    assert fault.value.codes == ("name-unknown",)
     assert "did you mean 'dense-air'?" in str(fault.value)
 
 
@@ -76,7 +76,7 @@ def test_what_is_not_complete_is_no_last_run(flown, tmp_path, missing):
     assert find_run(folder) == dense
     with pytest.raises(GateError) as fault:
         find_run(folder, "cut")
-    assert fault.value.codes == ("run-unknown",)
+    assert fault.value.codes == ("name-unknown",)
 
 
 def test_a_flight_without_a_complete_run_has_none(tmp_path):
@@ -146,14 +146,14 @@ def test_export_takes_the_run_that_is_asked_for(flown, tmp_path, command):
 def test_a_run_that_is_not_there_is_refused(flown, tmp_path, command, verb):
     words = ("--to", "csv") if verb == "export" else ("--output", tmp_path / "r.html")
     done = command(verb, flown, *words, "--run", "dense")
-    assert (done.returncode, printed_codes(done.stderr)) == (3, ["run-unknown"])
+    assert (done.returncode, printed_codes(done.stderr)) == (3, ["name-unknown"])
     assert not (tmp_path / "r.html").exists()
 
 
 def test_a_bad_name_is_refused_with_every_other_fault_before_anything_is_read():
     with pytest.raises(ConfigError) as fault:
         commands.asked(("c_n",), (), None, "a b")
-    assert fault.value.codes == ("run-name", "set-form")
+    assert fault.value.codes == ("option-format", "option-format")
 
 
 def test_report_says_that_it_is_of_a_what_if(flown, tmp_path, command):

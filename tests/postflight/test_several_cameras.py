@@ -48,12 +48,12 @@ def test_a_camera_goes_by_its_tables_name_without_a_mount(two):
 
 def test_one_camera_and_several_do_not_go_together(two):
     two.append('[frames]\nfile = "telemetry/frames.csv"\nfolder = "telemetry/camera5"')
-    refused(two, "[frames]", "[cameras.NAME]", codes={"frames-twice"})
+    refused(two, "[frames]", "[cameras.NAME]", codes={"keys-conflict"})
 
 
 def test_faults_name_the_camera(two):
     two.replace("flight.toml", 'second"\ncamera = "camera5"\n', 'second"\ncamera = "camera9"\n')
-    refused(two, "cameras.second", "camera9", codes={"camera-unknown"})
+    refused(two, "cameras.second", "camera9", codes={"name-unknown"})
 
 
 def test_check_tries_every_benchmark_frame(two):
@@ -61,7 +61,7 @@ def test_check_tries_every_benchmark_frame(two):
     cv2.imwrite(str(two.root / "telemetry/camera5/frame_0.png"), straight)
     cv2.imwrite(str(two.root / "telemetry/second/frame_0.png"), 0 * straight)
     found = [(f.source, f.code) for f in check_folder(two.root).cross_checks]
-    assert ("cameras.second", "frame-dark") in found
+    assert ("cameras.second", "frame-exposure") in found
     assert not [code for source, code in found if source == "cameras.camera5"]
 
 
@@ -135,7 +135,7 @@ def test_a_film_that_cannot_be_used_does_not_stop_the_other(filmed, command):
 def test_several_cameras_estimate_the_plane(filmed, command):
     done = command("deflection", filmed.root, "--method", "camera", "--plane", "153")
     assert done.returncode == 4
-    assert "plane-assumed" in printed_codes(done.stdout)
+    assert "keys-conflict" in printed_codes(done.stdout)
 
 
 def test_a_scenario_films_with_every_camera(tmp_path):

@@ -125,14 +125,14 @@ def test_faults_of_a_table_are_named(tmp_path):
         return refusal.value.codes
 
     assert codes(load="momentum", displacements=("angle_deg:kg",)) == ("column-missing", "unit-unknown")
-    assert codes(load="moment_nm:n") == ("arm-missing",)
+    assert codes(load="moment_nm:n") == ("input-missing",)
     mirrored = written(tmp_path / "sign.csv", "t_s,moment_nm,angle_deg", test, test.moment_nm, -test.angle_rad)
     assert codes(mirrored) == ("load-sign",)
     still = written(tmp_path / "still.csv", "t_s,moment_nm,angle_deg", test, 0.0 * test.moment_nm, test.angle_rad)
-    assert codes(still) == ("load-constant",)
+    assert codes(still) == ("too-few-data",)
     back = written(tmp_path / "back.csv", "t_s,moment_nm,angle_deg", replace(test, time_s=test.time_s[::-1]),
                    test.moment_nm, test.angle_rad)  # fmt: skip
-    assert codes(back) == ("time-order",)
+    assert codes(back) == ("time-backwards",)
     short = tmp_path / "short.csv"
     short.write_text("\n".join(good.read_text().splitlines()[:9]) + "\n")
     assert codes(short) == ("too-few-rows",)

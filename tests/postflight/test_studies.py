@@ -59,7 +59,7 @@ def test_a_planted_digit_is_seen(monkeypatch):
 
 
 def test_damping_study_says_what_the_paper_says(tmp_path):
-    commands.damping(VEHICLE, tmp_path, 0)
+    commands.joint_study("damping", VEHICLE, tmp_path, 0)
     table, paper = pd.read_csv(tmp_path / "damping.csv"), pd.read_csv(tmp_path / "damping_paper.csv")
     assert table["joint"].tolist() == [joints.LOCKED, "0.5 %", "1 %", "2.5 %", "5 %", "10 %", "20 %"]
     assert paper["agrees"].all()
@@ -72,7 +72,7 @@ def test_damping_study_says_what_the_paper_says(tmp_path):
 
 
 def test_stiffness_study_says_what_the_paper_says_where_it_can(tmp_path):
-    commands.stiffness(VEHICLE, tmp_path, 0)
+    commands.joint_study("stiffness", VEHICLE, tmp_path, 0)
     table = pd.read_csv(tmp_path / "stiffness.csv").set_index("joint")
     paper = pd.read_csv(tmp_path / "stiffness_paper.csv")
     assert paper["agrees"].tolist() == [True, False, True]  # the excursion is larger than flown: docs/studies.md
@@ -165,7 +165,7 @@ def test_a_locked_joint_carries_the_force_of_the_rigid_body():
 
 
 def test_an_unknown_vehicle_is_refused(tmp_path):
-    with refuses("vehicle-unknown", names=["'irve'"], kind=ConfigError):
+    with refuses("name-unknown", names=["'irve'"], kind=ConfigError):
         commands.stiffness_and_damping("irve", tmp_path)
 
 

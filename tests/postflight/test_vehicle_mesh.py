@@ -27,12 +27,12 @@ def test_a_mesh_goes_with_its_vehicle_and_is_checked_before_a_run(command, tmp_p
     assert done.returncode == 0, done.stderr
     found = json.loads(command("check", flight, "--json").stdout)
     assert found["exit_code"] == 0
-    assert [f["code"] for f in found["findings"] if "aeroshell" in f["source"]] == ["mesh-fitted"]
+    assert [f["code"] for f in found["findings"] if "aeroshell" in f["source"]] == ["mesh-use"]
     copy = flight / "vehicle" / "shell.stl"
     assert copy.read_bytes() == (tmp_path / "shell.stl").read_bytes()
     holed = trimesh.Trimesh(mesh.vertices, mesh.faces[1:], process=False)
     holed.export(copy)
     done = command("check", flight)
     assert done.returncode == 2
-    assert printed_codes(done.stdout) == ["mesh-not-watertight"]
+    assert printed_codes(done.stdout) == ["mesh-unusable"]
     assert re.search(r"shell\.stl\b.*\b3\b", done.stdout, re.DOTALL)

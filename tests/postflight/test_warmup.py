@@ -1,5 +1,6 @@
 """What is compiled before first use is what the commands then use: nothing is compiled a second time."""
 
+import itertools
 import os
 import subprocess
 import sys
@@ -53,34 +54,65 @@ def test_after_warmup_a_flight_and_its_reconstruction_compile_nothing(tmp_path):
     assert flown.stdout.strip() == "[]", flown.stderr
 
 
-def test_what_is_missing_is_compiled_once_and_reported(tmp_path):
+def in_fresh_cache(tmp_path, code):
+    """Run code as a program, whose worker processes import it."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    run = [sys.executable, "-c", "from postflight.warmup import prepare; prepare(['tables'], print)"]
-    first, again = (subprocess.run(run, env=environment, capture_output=True, text=True) for _ in range(2))
-    assert len(first.stdout.splitlines()) == 1
-    assert "tables" in first.stdout
-    assert [p.name.split("-")[0] for p in (tmp_path / "cache").rglob("*.compiled")] == ["tables"]
-    assert (again.returncode, again.stdout) == (0, ""), again.stderr
+    (tmp_path / "program.py").write_text(f"if __name__ == '__main__':\n    {code}\n")
+    run = [sys.executable, str(tmp_path / "program.py")]
+    return subprocess.run(run, env=environment, capture_output=True, text=True)
 
 
-def test_every_group_is_dealt_once_whatever_the_processors():
-    for processors in (1, 2, 3, 16):
-        shares = warmup._shares(list(warmup.GROUPS), processors)
-        assert sorted(group for share in shares for group in share) == sorted(warmup.GROUPS)
-        assert len(shares) <= processors
+def test_what_is_missing_is_compiled_once_and_reported(tmp_path):
+    code = "from postflight.commands import compile_kernels; compile_kernels('tables', 'spans')"
+    first, again = (in_fresh_cache(tmp_path, code) for _ in range(2))
+    assert first.returncode == 0, first.stderr
+    announced = first.stderr.splitlines()[0]
+    assert "tables" in announced
+    assert "spans" in announced
+    assert sorted(p.name.split("-")[0] for p in (tmp_path / "cache").rglob("*.compiled")) == ["spans", "tables"]
+    assert (again.returncode, again.stdout, again.stderr) == (0, "", "")
+
+
+def test_progress_names_what_is_compiled_and_never_stands_still(tmp_path):
+    code = "from postflight.warmup import prepare; print(prepare(['spans', 'tables'], lambda f, what: print(f, what)))"
+    done = in_fresh_cache(tmp_path, code)
+    *looks, failed = done.stdout.splitlines()
+    assert failed == "{}", done.stderr
+    fractions = [float(line.split()[0]) for line in looks]
+    assert all(0.0 <= one < two <= 1.0 for one, two in itertools.pairwise([f for f in fractions if f < 1.0]))
+    assert fractions[-1] == 1.0
+    assert "group 1 of 2: " in looks[0]
+    assert {"tables", "spans"} <= set(looks[0].replace(",", " ").replace(";", " ").split())
+    assert any(line.endswith(" s remain") for line in looks)
+
+
+def test_every_group_is_compiled_by_one_process_with_what_shares_its_parts():
+    shares = warmup._shares(list(warmup.GROUPS))
+    assert sorted(group for share in shares for group in share) == sorted(warmup.GROUPS)
     with_parts = next(share for share in shares if "ensembles" in share)
-    assert {"simulator", "creep"} <= set(with_parts)  # which has the same parts
+    assert {"simulator", "creep"} <= set(with_parts)
+    assert warmup._shares(["creep"]) == [["creep"]]
+    assert warmup._shares([]) == []
 
 
 def test_a_group_that_fails_is_reported_with_its_reason(tmp_path):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    code = "from postflight import warmup; warmup.prepare(['missing_group'], print)"
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    code = "from postflight import warmup; print(warmup.prepare(['missing_group'], lambda *_: None))"
+    done = in_fresh_cache(tmp_path, code)
     assert done.returncode == 0, done.stderr
-    compiling, failed = done.stdout.splitlines()
-    assert "missing_group" in compiling
-    assert "KeyError" in failed
+    assert "missing_group" in done.stdout
+    assert "KeyError" in done.stdout
     assert not list((tmp_path / "cache").rglob("*.compiled"))
+
+
+def test_a_process_that_is_killed_leaves_its_groups_to_their_first_use(tmp_path):
+    code = (
+        "import os, threading; from postflight import warmup; from postflight.beside import multiprocessing as m; "
+        "kill = lambda: [os.kill(p.pid, 9) for p in m.active_children()]; "
+        "threading.Timer(1.0, kill).start(); print(warmup.prepare(['camera'], lambda *_: None))"
+    )
+    done = in_fresh_cache(tmp_path, code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("{'camera': "), done.stdout
 
 
 def test_warmup_without_a_folder_to_keep_kernels_in_is_refused(tmp_path):

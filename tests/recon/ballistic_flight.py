@@ -9,9 +9,10 @@ from flightmodel import earth
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M, standard_sounding
 from flightmodel.instruments import GnssSpec, RadarSite
 from flightmodel.telemetry import GnssRecord, Motion, RadarRecord, Telemetry
-from recon.ekf import height
 from recon.propagation import ballistic_motion, propagate
 from recon.state import States
+
+from .one_node import height
 
 EPOCH = "2009-08-17T12:52:00Z"
 LATITUDE, LONGITUDE = -0.58, 0.31

@@ -12,11 +12,10 @@ import numpy as np
 from recon import _filter_kernels as kernels
 from recon import smoother
 from recon._measurement_kernels import SLOTS
-from recon.ekf import Filtered, Innovations, Observed, Steps, make_filter, schmidt_update
+from recon.ekf import Filtered, Innovations, Observed, Steps, full_step, make_filter, schmidt_update
 from recon.settings import COMPILED
-from recon.smoother import full_step
 from recon.state import Wander, packed
-from tests.oracles import bryson_frazier
+from tests.oracles import bryson_frazier, plain_smoother
 
 EMPTY = np.full(SLOTS, -1, dtype=np.int64)
 
@@ -151,7 +150,7 @@ class _Filterpy:
         v.gain[row][:, used] = schmidt_update(self.ekf, y, h, noise, problem.considered)
 
 
-def smooth(problem, out, innovations, method, engine=COMPILED):
+def smooth(problem, out, innovations, method):
     """Errors (n, N), packed covariances of the dense errors (n, ...) and variances (n, N) of one smoother."""
     n, size = out.x_plus.shape
     triangles, variance = np.empty_like(out.p_plus), np.empty((n, size))
@@ -167,7 +166,8 @@ def smooth(problem, out, innovations, method, engine=COMPILED):
         )
     else:
         x = out.x_plus.copy()
-        smoother.backward(engine)(problem.steps, out, problem.moving, x, triangles, variance)
+        one = plain_smoother if method.startswith("plain") else kernels
+        one.rauch_tung_striebel(problem.steps, out, problem.moving, x, triangles, variance)
     return x, triangles, variance
 
 

@@ -226,7 +226,7 @@ def test_points_are_where_rays_and_ranges_meet():
 
 
 def test_one_telescope_alone_is_refused():
-    with refuses("no-track-points"):
+    with refuses("too-few-data"):
         reconstruct_once(watch(1, SITES[:1], ("az", "el")), QUICK)
 
 

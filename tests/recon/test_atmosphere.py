@@ -199,7 +199,7 @@ def test_thin_air_is_refused_in_words():
         atmosphere.reconstruct_air(
             replace(samples, specific_force_body_mps2=np.zeros((len(samples.time_s), 3))), KNOWN, DRAG
         )
-    assert refusal.value.codes == ("air-not-observable",)
+    assert refusal.value.codes == ("too-few-data",)
 
 
 # ------------------------------------------------------------------------------------------- standard deviations
@@ -266,7 +266,7 @@ def test_coefficient_wrong_by_a_quarter_fails_its_check():
     seen = np.zeros((len(samples.time_s), atmosphere._UNKNOWNS))
     seen[:, 3] = np.log(1.25)
     checks = atmosphere.reconstruct_air(pushed(samples, seen), KNOWN, DRAG).consistency_checks
-    assert "pre-flight-ca" in {v.code for v in checks if not v.passed}
+    assert "pre-flight-drag" in {v.code for v in checks if not v.passed}
 
 
 def test_flow_that_turns_within_a_window_keeps_its_angle():

@@ -8,7 +8,8 @@ import pytest
 from flightmodel import earth, rotations
 from recon import attitude_smoother as smoother
 from recon._measurement_kernels import FIELD, SLOTS, SUN
-from recon.measurements import Instrument, NodeMotion, predict
+from recon.measurements import Instrument
+from tests.oracles.plain_measurements import NodeMotion, predict
 
 from .conftest import EPOCH, MAGNETOMETER
 from .conftest import SUN as HEADS

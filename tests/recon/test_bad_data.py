@@ -27,10 +27,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
 
-from flightmodel.checks import GateError
+from flightmodel.checks import GateError, Issue
 from flightmodel.flightfolder import read_flight
-from flightmodel.telemetry import Finding
-from recon.fault_isolation import FaultHypothesis, isolate_faults
+from recon.fault_isolation import isolate_faults
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from synthetic_flight.folder import simulate_to_folder
@@ -248,8 +247,8 @@ FAULTS = [
 class Outcome(NamedTuple):
     """A reconstruction with its errors, NED and body axes, over their standard deviations."""
 
-    hypotheses: tuple[FaultHypothesis, ...]
-    findings: tuple[Finding, ...]
+    hypotheses: tuple[Issue, ...]
+    findings: tuple[Issue, ...]
     time_s: np.ndarray
     normalised: np.ndarray
     sd: np.ndarray

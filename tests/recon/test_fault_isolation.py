@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from flightmodel.checks import Check
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
-from recon.consistency import consistency_check
 from recon.fault_isolation import (
     LeftOut,
     edit_checks_with_rejected,
@@ -100,7 +100,7 @@ def test_wrong_mount_is_laid_on_the_inertial_sensors(mini_sense):
 
 def failed(code, source="", component="", symptom="bad"):
     name = f"{code} {source} {component}".strip()
-    return consistency_check(code, name, 9.0, 0.0, 3.0, "good", symptom, source=source, component=component)
+    return Check.of(code, name, 9.0, 0.0, 3.0, "good", symptom, source=source, component=component)
 
 
 def codes(checks, left_out=()):
@@ -167,7 +167,7 @@ def test_attitude_and_air_come_last():
 def test_the_vehicle_comes_before_the_air_where_its_drag_is_farther_off():
     checks = (
         replace(failed("sounding-density", symptom="density"), value=5.0, high=4.0),
-        replace(failed("pre-flight-ca"), value=9.0, high=3.0),
+        replace(failed("pre-flight-drag"), value=9.0, high=3.0),
     )
     found = isolate_faults(checks, ())
     assert [h.sources for h in found] == [("vehicle", "atmosphere"), ("atmosphere", "vehicle")]
@@ -202,7 +202,7 @@ def test_points_of_the_only_inconsistent_tracker_are_judged_by_the_rest():
         ("gps", 50, 50),
     ]
     consistency_checks = (
-        consistency_check("edited", "edited gps", 0.0, 0.0, 0.05, "none", "many"),
+        Check.of("edited", "edited gps", 0.0, 0.0, 0.05, "none", "many"),
         failed("nis", "gps2"),
     )
     edited, other = edit_checks_with_rejected(consistency_checks, residuals, rejected)

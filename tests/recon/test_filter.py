@@ -7,14 +7,15 @@ import pytest
 
 from flightmodel import rotations
 from flightmodel.telemetry import RadarRecord
-from recon import _measurement_kernels, ekf
-from recon.ekf import forward
-from recon.measurements import NodeMotion, predict, wrapped
+from recon.ekf import as_charts, forward, full_step
+from recon.measurements import wrapped
 from recon.settings import ENGINES, FILTERPY
-from recon.smoother import full_step, smooth
+from recon.smoother import smooth
 from recon.state import packed, unpacked
+from tests.oracles.plain_measurements import NodeMotion, predict
 
 from .ballistic_flight import fly, watch
+from .one_node import motion_at
 from .problems import build, off_in_covariance, off_in_states
 
 SHORT = {"end_s": 106.2, "output_rate_hz": 4.0}
@@ -166,10 +167,7 @@ def textbook_measurement(problem, reference, row, slots):
     """Prediction, partials by all errors, noise and used components of one measurement, from the numpy twins."""
     k, source = problem.node[row], problem.observed.source[row]
     at, slot = reference[int(k)], slots[source]
-    rate, acceleration = np.empty((12, 3)), np.empty(3)
-    _measurement_kernels.motion_at(
-        problem.motion, problem.node_index[k], *ekf.as_charts(at), rate, acceleration
-    )  # fmt: skip
+    rate, acceleration = motion_at(problem.motion, problem.node_index[k], *as_charts(at))
     e = np.where(slot >= 0, at.sensor_errors[slot], 0.0)
     c = rotations.dcm_from_q(at.q_ecef_body)
     motion = NodeMotion(at.position_ecef_m, at.velocity_ecef_mps, c, rate, acceleration)
@@ -193,7 +191,7 @@ def test_considered_errors_never_move(problems, name, engine):
     assert not run.innovations.gain[:, rows].any()
     p = unpacked(run.filtered.p_minus)[:, rows][:, :, rows]
     assert np.abs(p / np.outer(sd, sd) - np.eye(len(rows))).max() < 1e-12
-    smoothed = smooth(problem, run, engine=engine)
+    smoothed = smooth(problem, run)
     assert not smoothed.x[:, rows].any()
     assert np.allclose(smoothed.variance[:, rows], sd**2, rtol=1e-12)
     # what they may have done is in everything else

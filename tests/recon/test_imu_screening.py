@@ -173,5 +173,5 @@ def test_sensors_too_sparse_for_forces_are_refused_in_words():
         required_triads=lambda: (SimpleNamespace(spec=SPEC), SimpleNamespace(spec=SPEC)),
     )
     t = np.arange(0.0, 20.0, 0.25)
-    with refuses("samples-too-sparse", names=("0.25 s",)):
+    with refuses("too-few-data", names=("0.25 s",)):
         _air_samples(telemetry, SimpleNamespace(imu_time_s=t, smoothed=SimpleNamespace(time_s=t)))

@@ -8,16 +8,13 @@ import pytest
 from flightmodel import earth, rotations
 from flightmodel.instruments import BarometerSpec, GnssSpec, RadarSite, TriadSpec, sun_angles_from_direction
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, TriadRecord
-from recon import _measurement_kernels
 from recon._measurement_kernels import FIELD, HEIGHT, POSITION, RADAR, RANGE_RATE, SLOTS, SUN, VELOCITY
 from recon.measurements import (
     SLOT_NAMES,
     Instrument,
-    NodeMotion,
     barometer_instrument,
     gnss_instruments,
     magnetometer_instrument,
-    predict,
     radar_instrument,
     wrapped,
 )
@@ -26,6 +23,9 @@ from recon.settings import Settings
 from recon.setup import tracking_instruments
 from synthetic_flight import sensing
 from synthetic_flight.instrument_errors import Radar, child
+from tests.oracles.plain_measurements import NodeMotion, predict
+
+from .one_node import motion_at, predicted
 
 LATITUDE, LONGITUDE, HEIGHT_M = -0.58, 0.31, 40.0
 ARM = np.array([0.41, -0.36, 0.73])
@@ -108,12 +108,7 @@ def place():
 
 
 def compiled(source, e, position, velocity, q, rate=RATE, acceleration=ACCELERATION):
-    h, by_state, by_error = np.empty(3), np.empty((3, 9)), np.empty((3, SLOTS))
-    _measurement_kernels.predict_one(
-        source.kind, source.arm_body_m, source.site_ecef_m, source.dcm, known(source.kind), e, position, velocity, q,
-        rate, acceleration, h, by_state, by_error, earth.WGS84,
-    )  # fmt: skip
-    return h, by_state, by_error
+    return predicted(source, known(source.kind), e, position, velocity, q, rate, acceleration)
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
@@ -275,9 +270,7 @@ def test_gyros_errors_move_an_antenna_beside_the_accelerometer(kind):
     motion = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts, clocks=True)
 
     def seen(errors):
-        turning, acceleration = np.empty((12, 3)), np.empty(3)
-        _measurement_kernels.motion_at(motion, 1, *at, errors, turning, acceleration)
-        return compiled(source, np.zeros(SLOTS), *at, turning, acceleration)
+        return compiled(source, np.zeros(SLOTS), *at, *motion_at(motion, 1, *at, errors))
 
     errors = np.append(rng.normal(0.0, 0.01, 18), [0.0, 1e-3])
     by_gyros = seen(errors)[2][:, 4:14]

@@ -53,5 +53,5 @@ def test_nothing_stated_is_refused():
     silent = stated(telemetry, **dict.fromkeys(TRUE, 0.0), wander_sd_m=0.0)
     triads = {name: getattr(silent, name) for name in ("accelerometer", "rates")}
     silent = replace(silent, **{n: replace(r, spec=replace(r.spec, noise_sd=0.0)) for n, r in triads.items()})
-    with refuses("noise-unknown", kind=GateError):
+    with refuses("input-missing", kind=GateError):
         noise_levels(silent)

@@ -179,7 +179,7 @@ def test_a_tracker_of_which_every_point_was_rejected_is_set_right_red_and_named(
     record = telemetry.radars["west"]
     late = replace(telemetry, radars=telemetry.radars | {"west": replace(record, time_s=record.time_s + 1.0)})
     solution = reconstruct(late, FAST)
-    assert [(v.code, v.source) for v in solution.consistency_checks if not v.passed] == [("tracker-time", "west")]
+    assert [(v.code, v.source) for v in solution.consistency_checks if not v.passed] == [("clock-corrected", "west")]
     first = isolate_faults(solution.consistency_checks, solution.left_out, solution.single_faults)[0]
     assert first.sources == ("west",)
 

@@ -30,4 +30,4 @@ def test_no_other_rate_where_none_is_asked_for(mini_sense, rate):
 def test_pulse_rate_is_checked():
     with pytest.raises(ConfigError) as refusal:
         Settings(pulse_rate_hz=-1.0)
-    assert refusal.value.codes == ("setting-range",)
+    assert refusal.value.codes == ("value-range",)

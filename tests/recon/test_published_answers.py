@@ -16,7 +16,7 @@ import pytest
 
 from flightmodel import earth
 from recon._measurement_kernels import HEIGHT, SLOTS
-from recon.ekf import Observed, Problem, Steps, forward, height, observe
+from recon.ekf import Observed, Problem, Steps, forward, observe
 from recon.measurements import Instrument
 from recon.propagation import propagate, strapdown_motion
 from recon.settings import ENGINES
@@ -25,6 +25,7 @@ from recon.state import Block, ErrorModel, States, Wander, unpacked
 from tests.oracles import bryson_frazier
 
 from . import linear
+from .one_node import height
 
 DATA = Path(__file__).parents[1] / "data" / "kalman"
 KNOWN_SD = 1e-12
@@ -76,7 +77,7 @@ def level_problem(series, noise_var, walk_var, mean, variance):
 def answers(problem, engine, method):
     """Predicted, filtered and smoothed level with the variances of the first and last, and innovations."""
     run = forward(problem, engine=engine)
-    smoothed = bryson_frazier.smooth(problem, run) if method == "bryson-frazier" else smooth(problem, run, True, engine)
+    smoothed = bryson_frazier.smooth(problem, run) if method == "bryson-frazier" else smooth(problem, run)
     predicted = run.charts.sensor_errors[:, BIAS] + run.filtered.x_minus[:, 9 + BIAS]
     return {
         "a": predicted,
@@ -175,7 +176,7 @@ def trend_problem(series, mean, covariance):
 def trend_answers(problem, engine, method):
     """States (n, 2) and sums of their covariances, predicted and smoothed, and filtered states."""
     out, innovations = linear.run(problem, engine)
-    x, triangles, _ = linear.smooth(problem, out, innovations, method, engine)
+    x, triangles, _ = linear.smooth(problem, out, innovations, method)
     return {
         "a": out.x_minus[:, :2],
         "sumP": unpacked(out.p_minus)[:, :2, :2].sum(axis=(1, 2)),

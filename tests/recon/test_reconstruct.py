@@ -190,7 +190,7 @@ def test_settings_of_the_flight_file_are_used_where_none_are_given(mini_sense):
     assert found.smoothed.time_s[-1] <= 110.0
     with pytest.raises(ConfigError) as refusal:
         reconstruct(replace(telemetry, reconstruction={"output_rate": 2.0, "passes": 99}))
-    assert refusal.value.codes == ("setting-unknown", "setting-range")
+    assert refusal.value.codes == ("name-unknown", "value-range")
 
 
 def test_a_single_filter_about_its_own_estimate_comes_near(mini_sense, mini_truth):
@@ -328,7 +328,7 @@ def test_no_common_span_is_refused_in_words(mini_sense):
     telemetry, _ = mini_sense(900)
     with pytest.raises(GateError) as refusal:
         reconstruct(telemetry, Settings(start_s=159.5))
-    assert refusal.value.codes == ("span-too-short",)
+    assert refusal.value.codes == ("time-not-covered",)
 
 
 def test_progress_rises_to_one(mini_sense):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from recon import _filter_kernels, _measurement_kernels, ekf, propagation
+from recon import _filter_kernels, ekf, propagation
 from recon._glr_kernels import offset_scores
 from recon.propagation import correct, propagate, strapdown_motion, with_exact_integrals
 from recon.settings import ENGINES, FILTERPY
@@ -17,6 +17,7 @@ from tests.oracles import strapdown as plain_strapdown
 
 from . import linear
 from .ballistic_flight import SPEC, across_plane, entry_state, fly, watch, windy_sounding
+from .one_node import motion_at
 from .problems import build
 
 DRIVERS = np.array([0.1, 0.05, -0.08, 0.7, -1.1, 0.6])
@@ -106,8 +107,7 @@ def test_motion_at_a_node_is_newton_s_on_a_turning_earth():
     motion = strapdown_motion(np.array([0.0, 0.01]), force, rate, one, one, *mounts)
     position, velocity = earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.array([1500.0, -900.0, 700.0])
     q, errors = rotations.exp(rng.normal(0, 1, 3)), rng.normal(0, 0.02, 18)
-    seen_rate, acceleration = np.empty((12, 3)), np.empty(3)
-    _measurement_kernels.motion_at(motion, 1, position, velocity, q, errors, seen_rate, acceleration)
+    seen_rate, acceleration = motion_at(motion, 1, position, velocity, q, errors)
     f, w = (correct(s[1], e, m) for s, e, m in zip((force, rate), (errors[:9], errors[9:]), mounts, strict=True))
     spin = earth.OMEGA_ECEF_RADPS
     want = rotations.rotate(q, f) + earth.gravitation(position)
@@ -133,9 +133,8 @@ def test_the_rate_at_a_node_is_the_curve_s_by_the_gyros_own_clock():
     errors[15:18] = 0.0
     one = np.ones((len(t), 3))
     motion = strapdown_motion(t, 0.0 * one, with_exact_integrals(t, tagged), one, one, level, level, True)
-    seen, acceleration = np.empty((12, 3)), np.empty(3)
     place = earth.ecef_from_geodetic(-0.6, 1.2, 9e4), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
-    _measurement_kernels.motion_at(motion, 4, *place, errors, seen, acceleration)
+    seen, _ = motion_at(motion, 4, *place, errors)
     np.testing.assert_allclose(seen[0], curve(t[[4]])[0], atol=0.015)  # a tag's second order
     # as read it is 0.6 rad/s off
     assert np.linalg.norm(tagged[4] - errors[9:12] - curve(t[[4]])[0]) > 0.5

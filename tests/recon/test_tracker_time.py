@@ -38,13 +38,13 @@ def always(late_s):
     return lambda t: np.full(len(t), late_s)
 
 
-@pytest.mark.parametrize(("late_s", "red"), [(-0.8, set()), (1.4, set()), (3.0, {("tracker-time", "gps")})])
+@pytest.mark.parametrize(("late_s", "red"), [(-0.8, set()), (1.4, set()), (3.0, {("clock-corrected", "gps")})])
 def test_a_lag_of_seconds_is_found_and_judged_by_what_is_stated(late_s, red, with_receiver, mini_truth):
     telemetry = with_receiver(always(late_s))
     bet = reconstruct(telemetry, FAST)
     assert codes(bet) == red
     assert nees(bet.smoothed, mini_truth).mean() < 6.0
-    (check,) = (v for v in bet.consistency_checks if v.code == "tracker-time")
+    (check,) = (v for v in bet.consistency_checks if v.code == "clock-corrected")
     row = bet.sensor_errors.set_index("name").loc["gps time bias"]
     assert row.estimate == pytest.approx(late_s, abs=4.0 * row.sd)
     assert row.sd < 0.02
@@ -57,7 +57,7 @@ def test_a_lag_of_seconds_is_found_and_judged_by_what_is_stated(late_s, red, wit
 
 def test_without_a_stated_time_bias_a_lag_is_named(with_receiver, mini_truth):
     bet = reconstruct(with_receiver(always(0.5), prior_s=0.0), FAST)
-    assert codes(bet) == {("tracker-time", "gps")}
+    assert codes(bet) == {("clock-corrected", "gps")}
     assert isolate_faults(bet.consistency_checks, bet.left_out, bet.single_faults)[0].sources == ("gps",)
     assert nees(bet.smoothed, mini_truth).mean() < 6.0
 
@@ -66,7 +66,7 @@ def test_tags_that_are_right_are_left(with_receiver):
     telemetry = with_receiver(always(0.0))
     bet = reconstruct(telemetry, FAST)
     assert codes(bet) == set()
-    assert "tracker-time" not in {v.code for v in bet.consistency_checks}
+    assert "clock-corrected" not in {v.code for v in bet.consistency_checks}
     np.testing.assert_array_equal(bet.smoothed.covariance, reconstruct_once(telemetry, FAST).smoothed.covariance)
 
 
@@ -75,7 +75,7 @@ def test_both_radars_that_are_late_are_named_and_set_right(mini_sense, mini_trut
     for name in ("north", "west"):
         telemetry = spoiled(telemetry, name, seconds=0.5)
     bet = reconstruct(telemetry, FAST)
-    assert codes(bet) == {("tracker-time", "north"), ("tracker-time", "west")}
+    assert codes(bet) == {("clock-corrected", "north"), ("clock-corrected", "west")}
     assert nees(bet.smoothed, mini_truth).mean() < 6.0
 
 

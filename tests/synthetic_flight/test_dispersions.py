@@ -175,7 +175,7 @@ def test_a_joint_that_diverges_holds_its_last_value(short):
 
 
 def test_windows_that_do_not_fit_are_refused(short):
-    with refuses("window-outside-flight", names=[r"\b401\b", r"\b400\.5\b"], kind=ConfigError):
+    with refuses("time-not-covered", names=[r"\b401\b", r"\b400\.5\b"], kind=ConfigError):
         legs(short.spec.time, Window(from_s=400.5, to_s=405.0), locked=False)
     with pytest.raises(ValueError, match="record_s"):
         Window(from_s=1.0, to_s=2.0, record_s=0.02, history_s=0.05)

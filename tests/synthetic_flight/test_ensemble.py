@@ -84,7 +84,7 @@ def test_wrong_schedules_are_refused(vehicle, dispersed):
     for schedule, workers in ((replace(SCHEDULE, step_s=0.0), 1), (SCHEDULE, 0)):
         with pytest.raises(ConfigError) as refusal:
             list(fly_ensemble(vehicle, dispersed, range(2), schedule, workers=workers))
-        assert refusal.value.codes == ("ensemble-arguments",)
+        assert refusal.value.codes == ("argument-value",)
 
 
 @pytest.mark.parametrize(

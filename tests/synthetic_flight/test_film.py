@@ -175,7 +175,7 @@ def test_noise_has_the_declared_level(off_camera):
 
 def test_film_refuses_lengths_that_differ_and_nan():
     light, rng = np.zeros((3, 3)), np.random.default_rng(0)
-    with refuses("array-shape", names=["plane_lv_rad"]):
+    with refuses("argument-value", names=["plane_lv_rad"]):
         render_video(GEOMETRY, MOUNT, JOINT_M, np.zeros(3), np.zeros(2), light, rng)
     with refuses("not-finite", names=["theta"]):
         render_video(GEOMETRY, MOUNT, JOINT_M, np.full(3, np.nan), np.zeros(3), light, rng)

@@ -52,7 +52,7 @@ def test_an_old_flight_whose_successor_was_never_put_in_place_comes_back(tmp_pat
     (tmp_path / "a").rename(tmp_path / f".old-{machine()}-{dead_process_number()}-00000000-a")
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(short, 1, tmp_path / "a")
-    assert refusal.value.codes == ("folder-exists",)
+    assert refusal.value.codes == ("file-exists",)
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
@@ -61,7 +61,7 @@ def test_a_link_is_followed_and_stays_a_link(tmp_path, short):
     (tmp_path / "link").symlink_to(tmp_path / "real")
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(short, 1, tmp_path / "link")
-    assert refusal.value.codes == ("folder-exists",)
+    assert refusal.value.codes == ("file-exists",)
     before = (tmp_path / "real" / "flight.toml").stat().st_ino
     simulate_to_folder(short, 1, tmp_path / "link", replace=True)
     assert (tmp_path / "link").is_symlink()
@@ -73,7 +73,7 @@ def test_a_flight_too_short_for_its_telemetry_says_so(tmp_path, short):
     late = replace(short, spec=short.spec.model_copy(update={"time": time}))
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(late, 0, tmp_path / "a")
-    assert refusal.value.codes == ("telemetry-too-short",)
+    assert refusal.value.codes == ("time-not-covered",)
     assert "99.00 s" in str(refusal.value)
     assert "time.telemetry_from_s = 98.5" in str(refusal.value)
     assert list(tmp_path.iterdir()) == []

@@ -89,7 +89,7 @@ def test_events_give_the_times_and_unknown_ones_are_refused(vehicle):
     named = replace(vehicle, mass_steps=(step, MassStep(from_s=5.0, aeroshell=vehicle.aeroshell)))
     timed = named.with_events([("cover gone", 7.0)])
     assert [s.from_s for s in timed.mass_steps] == [5.0, 7.0]
-    with refuses("event-unknown", names=["cover gon"], kind=ConfigError):
+    with refuses("name-unknown", names=["cover gon"], kind=ConfigError):
         named.with_events([("cover gonne", 7.0)])
 
 

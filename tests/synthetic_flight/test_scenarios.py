@@ -86,7 +86,7 @@ def test_a_table_elsewhere_or_pushing_sideways_in_axial_flow_is_refused(tmp_path
     (tmp_path / "tables").mkdir()
     (tmp_path / "tables" / "mine.csv").write_text(TABLE.replace("5,0,1.5,0.0,", "5,0,1.5,0.02,"))
     (tmp_path / "tables" / "mine.toml").write_text(SIDECAR)
-    with refuses("aero-axial-flow", names=[r"line 9\b", "'cn'", r"\b0\.02\b"]):
+    with refuses("aero-grid", names=[r"line 9\b", "'cn'", r"\b0\.02\b"]):
         read_scenario(write(tmp_path, vehicle=own_table()))
 
 
@@ -149,7 +149,7 @@ def test_a_package_of_any_name_and_a_receiver_without_a_radar_are_read_back(tmp_
 @pytest.mark.parametrize(
     ("changes", "codes", "names"),
     [
-        ({"[accelerometer]": '[accelerometer]\nmount = "sub"'}, {"mount-unknown"}, ["accelerometer.mount", "suba"]),
+        ({"[accelerometer]": '[accelerometer]\nmount = "sub"'}, {"name-unknown"}, ["accelerometer.mount", "suba"]),
         ({"[radars.shore]": "[gnss.shore]"}, {"key-unknown", "key-missing"}, ["horizontal_sd_m"]),
         ({"[attitude_prior]": GNSS.replace("gps", "shore") + "[attitude_prior]"}, {"keys-conflict"}, [r"gnss\.shore"]),
         ({"[atmosphere]": "[[events]]\nname = 'x'\nt_s = 'y'\n[atmosphere]"}, {"key-value"}, ["events.0.t_s"]),

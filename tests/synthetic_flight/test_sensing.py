@@ -160,17 +160,17 @@ def test_folders_are_reproducible_and_never_overwritten(tmp_path, scenario):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing partial beside them
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(brief, 2, tmp_path / "a")
-    assert refusal.value.codes == ("folder-exists",)
+    assert refusal.value.codes == ("file-exists",)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
     with pytest.raises(GateError) as refusal:
         simulate_to_folder(brief, 2, tmp_path / "mine", replace=True)
-    assert refusal.value.codes == ("folder-not-synthetic",)
+    assert refusal.value.codes == ("file-exists",)
     assert (tmp_path / "mine" / "thesis.txt").exists()
 
 
 def test_unknown_scenario_and_faults_of_a_file(tmp_path):
-    with refuses("scenario-unknown", names=["'irve2_reference'"], kind=ConfigError):
+    with refuses("name-unknown", names=["'irve2_reference'"], kind=ConfigError):
         read_scenario("irve2_refernce")
     text = read_scenario("irve2_reference").source.read_text()
     (tmp_path / "bad.toml").write_text(

@@ -100,7 +100,7 @@ def test_the_added_inertia_is_the_least_that_brings_the_roots_inside(damping):
 def test_a_step_that_blurs_the_joint_is_refused(vehicle):
     inertia, _, _ = joint_modes(vehicle)["bending"]
     ten_hz = with_joint(vehicle, bending_stiffness_nmprad=inertia * (2.0 * np.pi * 10.0) ** 2)
-    with refuses("step-too-coarse", names=["10.0 Hz", "16.7 ms", "6.4 ms"], kind=ConfigError):
+    with refuses("step-too-long", names=["10.0 Hz", "16.7 ms", "6.4 ms"], kind=ConfigError):
         dynamics.check_resolved(ten_hz, 1.0 / 60.0)
     dynamics.check_resolved(ten_hz, 0.0063)
     dynamics.check_resolved(vehicle, 1.0 / 60.0)

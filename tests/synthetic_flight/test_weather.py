@@ -274,7 +274,7 @@ def test_a_measured_sounding_is_flown_as_measured(tmp_path):
 def test_faults_of_a_sounding_are_named(tmp_path):
     z = np.arange(0.0, 80001.0, 5000.0)
     sounding(tmp_path, z, day().at(z), "alt_m,rho_kgpm3,t_k,wind_n_mps,wind_x_mps")
-    with refuses("table-column-missing", names=["wind"], kind=ConfigError):
+    with refuses("column-missing", names=["wind"], kind=ConfigError):
         flown_from(tmp_path)
     (tmp_path / "sounding.csv").unlink()
     with refuses("file-missing", kind=ConfigError):
@@ -301,5 +301,5 @@ def test_winds_of_hwm_are_refused_with_the_way_to_state_them():
 def test_nrlmsis_without_its_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pymsis", None)
     spec = parse_section(DayOfFlightAtmosphere, {"base": "nrlmsis"}, "test")
-    with refuses("nrlmsis-missing", names=[r"postflight\[msis\]"], kind=ConfigError):
+    with refuses("package-missing", names=[r"postflight\[msis\]"], kind=ConfigError):
         mean_air(spec, HERE, "2001-01-01T00:00:00Z", 0.1, 0.1)

@@ -111,7 +111,7 @@ def test_a_run_with_a_gap_is_read_back_by_every_command(table, pulse, command, t
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("part", "fault"),
-    [("entry_bounds", GateError("no entry", "entry-missing")), ("write_report", RuntimeError("a defect"))],
+    [("entry_bounds", GateError("no entry", "time-not-covered")), ("write_report", RuntimeError("a defect"))],
     ids=["refused bands", "a report that fails"],
 )
 def test_answers_stay_whatever_ends_what_follows_them(part, fault, pulse, capsys, monkeypatch, tmp_path):
@@ -130,7 +130,7 @@ def test_answers_stay_whatever_ends_what_follows_them(part, fault, pulse, capsys
     summary = json.loads((run / "summary.json").read_text())
     assert summary["methods"]["fused"]["deflection_deg"] is not None
     assert any("bounds of the rigid vehicle" in words for words in summary["missing"]) == refused
-    assert ("[entry-missing]" in done.stdout) == refused
+    assert ("[time-not-covered]" in done.stdout) == refused
     monkeypatch.undo()
     assert runner(capsys, monkeypatch)("score", flight).returncode == 0
 

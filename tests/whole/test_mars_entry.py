@@ -389,9 +389,9 @@ def test_a_hypothesis_that_diverges_is_no_traceback(tmp_path, monkeypatch):
 
 MISREAD = {
     "a deceleration counted positive": ("deceleration-sign", lambda rows: rows * [1.0, -1.0], ("", "")),
-    "a spacecraft's clock": ("times-apart", lambda rows: np.array([896220500.0, 0.0]) + rows, ("", "")),
-    "a radius in km": ("state-height", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 3522.2")),
-    "an altitude for a radius": ("state-height", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 126010.0")),
+    "a spacecraft's clock": ("time-not-covered", lambda rows: np.array([896220500.0, 0.0]) + rows, ("", "")),
+    "a radius in km": ("value-range", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 3522.2")),
+    "an altitude for a radius": ("value-range", lambda rows: rows, ("radius_m = 3522200.0", "radius_m = 126010.0")),
 }
 
 

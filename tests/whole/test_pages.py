@@ -128,7 +128,6 @@ WRITES = {
     "postflight init flight-b --vehicle irve2_reference": "flight-b/flight.toml",
     "postflight init flight-c --vehicle flight-a/vehicle/vehicle.toml": "flight-c/vehicle/vehicle.toml",
     "postflight montecarlo run irve2_reference my-study --flights 1000": "my-study/percentiles.csv my-study/bands.png",
-    "postflight montecarlo sobol irve2_reference indices --base 128 --by factor": "indices/sobol.csv indices/sobol.png",
     "postflight study stiffness": "study-stiffness/*.csv study-stiffness/*.png",
     "postflight study table-3.1": "study-table-3.1/*.csv",
     "postflight study damping --seed 0": "study-damping/*.csv study-damping/figure_3_1.png",

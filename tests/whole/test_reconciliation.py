@@ -313,15 +313,14 @@ def test_the_posterior_is_that_of_new_fits(flown):
     table = posterior_summary(sampled).set_index("quantity")
     for name in ("stiffness_nmprad", "cg_offset_y_cm", "cg_offset_z_cm", "static_stability"):
         assert table.sd[name] == pytest.approx(table.linear_sd[name], rel=0.3), name
-    assert abs(sampled.log_evidence - found.log_evidence) < 1.0
 
 
 def test_a_flight_without_a_pulse_is_refused(flown):
     flight = reconstruct(Flight(read_flight(flown[0])))
     with pytest.raises(GateError) as refusal:
         select_measurements(replace(flight, loads=None, missing=("no vehicle is given",)))
-    assert refusal.value.codes == ("loads-missing",)
+    assert refusal.value.codes == ("input-missing",)
     high = replace(flight, air=replace(flight.air, altitude_m=flight.air.altitude_m + 200e3))
     with pytest.raises(GateError) as refusal:
         select_measurements(high)
-    assert refusal.value.codes == ("entry-missing",)
+    assert refusal.value.codes == ("time-not-covered",)

@@ -1,7 +1,6 @@
-"""The same bytes under one hash, whatever number of threads and cores a machine gives to linear algebra; and memory."""
+"""The same bytes under one hash, whatever number of threads and cores a machine gives to linear algebra."""
 
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -49,39 +48,3 @@ def test_runs_with_one_two_and_four_threads_are_the_same_bytes(short, tmp_path):
     assert len(written[0]) > 30
     for other in written[1:]:
         assert_same(other, written[0])
-
-
-HOLES = """
-import resource, sys
-from pathlib import Path
-from postflight.streams import return_large_arrays
-if sys.argv[1] == "returned":
-    return_large_arrays()
-import numpy as np
-
-def resident_mb():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
-
-large = np.ones(3_000_000)  # 24 MB: freed, it raises the size from which the C library takes maps
-del large
-arrays, small = [], []
-for _ in range(50):
-    arrays.append(np.ones(600_000))
-    small.append(np.ones(500))  # what is left between them
-before = resident_mb()
-del arrays
-print(before - resident_mb())
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries are asked for nothing")
-def test_freed_arrays_go_back_to_the_system():
-    # Dask's workers, started by a test before this one, leave the C library's own settings in the environment
-    plain = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
-
-    def freed_mb(how):
-        done = subprocess.run([sys.executable, "-c", HOLES, how], env=plain, capture_output=True, text=True, check=True)
-        return float(done.stdout)
-
-    assert freed_mb("returned") > 230.0  # of 240
-    assert freed_mb("as it is") < 100.0  # else there is nothing to ask for

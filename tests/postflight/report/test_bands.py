@@ -70,18 +70,18 @@ def test_what_holds_no_bands_is_refused(run, reported, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(GateError) as refusal:
         write_report(reported, target=tmp_path / "r.html", studies=(tmp_path / "empty",))
-    assert refusal.value.codes == ("bands-missing",)
+    assert refusal.value.codes == ("file-missing",)
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     with pytest.raises(GateError) as refusal:
         panels.study_panels(run, (tmp_path / "other.csv",))
-    assert refusal.value.codes == ("bands-unreadable",)
+    assert refusal.value.codes == ("file-unreadable",)
     (tmp_path / "bare").mkdir()
     (tmp_path / "bare" / "bands.csv").write_text("history,time_s,flights,p2.3,p50,p97.7\n")
     with pytest.raises(GateError) as refusal:
         panels.study_panels(run, (tmp_path / "bare",))
-    assert refusal.value.codes == ("bands-empty",)
+    assert refusal.value.codes == ("too-few-data",)
     late = study(tmp_path, "late", "mach", np.array([900.0, 901.0]), np.zeros(2), np.ones(2))
     with pytest.raises(GateError) as refusal:
         panels.study_panels(run, (late,))
-    assert refusal.value.codes == ("bands-of-another-flight",)
+    assert refusal.value.codes == ("time-not-covered",)
     assert not (tmp_path / "r.html").exists()

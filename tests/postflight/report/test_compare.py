@@ -162,7 +162,7 @@ def test_too_few_too_many_and_equal_runs_are_refused(pair):
     for runs, code in (
         ((first,), "compare-runs"),
         ((first, other) * 4, "compare-runs"),
-        ((first, first), "compare-same-run"),
+        ((first, first), "given-twice"),
     ):
         with pytest.raises(ConfigError) as fault:
             compare_runs(runs)
@@ -176,7 +176,7 @@ def test_every_word_that_means_no_run_is_named(flown, tmp_path, capsys, monkeypa
     (tmp_path / "empty").mkdir()
     done = run("compare", flown / "dens", tmp_path / "nowhere", cut, tmp_path / "empty", flown / "plain")
     assert done.returncode == 3
-    assert printed_codes(done.stderr) == ["run-unknown", "run-unknown", "run-incomplete", "run-missing"]
+    assert printed_codes(done.stderr) == ["name-unknown", "name-unknown", "run-incomplete", "run-missing"]
     assert "did you mean 'dense'?" in done.stderr
 
 
@@ -195,10 +195,10 @@ def test_only_an_earlier_comparison_is_replaced(flown, tmp_path, capsys, monkeyp
         assert {p.name for p in (tmp_path / "made").iterdir()} == {PAGE_NAME, *(f"{name}.csv" for name in TABLES)}
     (tmp_path / "made" / "mine.txt").write_text("kept")
     done = run(*words, tmp_path / "made")
-    assert (done.returncode, printed_codes(done.stderr)) == (3, ["folder-exists"])
+    assert (done.returncode, printed_codes(done.stderr)) == (3, ["file-exists"])
     assert (tmp_path / "made" / "mine.txt").read_text() == "kept"
     done = run(*words, flown / "runs" / "x")
-    assert (done.returncode, printed_codes(done.stderr)) == (3, ["export-into-run"])
+    assert (done.returncode, printed_codes(done.stderr)) == (3, ["file-exists"])
 
 
 @pytest.mark.parametrize("step", ["page", "plain_text"])

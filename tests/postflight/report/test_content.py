@@ -72,14 +72,14 @@ def test_frames_to_look_at_first():
     """Refused frames with one of each code first; then a large residual, and a step against the neighbours."""
     rms, theta = [0.2, 0.21, 0.19, 0.2] * 5, [float(x) for x in np.linspace(1.0, 3.0, 20)]
     rms[12], theta[5] = 0.9, theta[5] + 1.5
-    refused = {2: "frame-dark", 3: "frame-dark", 8: "edge-too-short", 9: "frame-dark"}
+    refused = {2: "frame-exposure", 3: "frame-exposure", 8: "edge-too-short", 9: "frame-exposure"}
     first = pictures.worst_first(frames_table(rms, theta, refused))
     assert first[:2] == [2, 8]
     assert first[2] in (3, 9)
     assert set(first[3:5]) == {5, 12}
     assert sorted(first) == list(range(20))
     assert pictures.worst_first(frames_table(rms, theta, {}))[:2] == [5, 12]
-    every = dict.fromkeys(range(20), "frame-dark")
+    every = dict.fromkeys(range(20), "frame-exposure")
     assert sorted(pictures.worst_first(frames_table(rms, theta, every))) == list(range(20))
 
 

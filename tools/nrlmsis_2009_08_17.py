@@ -6,7 +6,7 @@ F10.7 = 67, its 81-day mean 68, Ap = 4. They are rounded values of the deep sola
 bulletin of 28 August 2009 gives 67.6 to 66.4 sfu and A = 3 to 11 for 20 to 26 August); the day's own three-hourly
 indices are not used. Below 110 km they matter little: F10.7 = 100 and Ap = 15 would change density by 1.3 % and
 temperature by 5 K at most. The model's output is a work of the United States Government, free of copyright there.
-Run: ``python nrlmsis_2009_08_17.py`` (needs the ``dev`` extra).
+Run: ``python tools/nrlmsis_2009_08_17.py`` (needs the ``dev`` extra).
 """
 
 from __future__ import annotations
@@ -42,4 +42,5 @@ if __name__ == "__main__":
         "altitude_m,density_kgpm3,temperature_k,molar_mass_gpmol",
     ]
     lines += [f"{z:.0f},{rho:.5e},{t:.2f},{m:.4f}" for z, rho, t, m in rows()]
-    Path(__file__).with_suffix(".csv").write_text("\n".join(lines) + "\n")
+    table = Path(__file__).parents[1] / "flightmodel" / "data" / "atmosphere" / "nrlmsis_2009_08_17.csv"
+    table.write_text("\n".join(lines) + "\n")

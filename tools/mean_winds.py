@@ -14,7 +14,7 @@ north wind is an order smaller and left at zero.
 Assumed to be good to 10 m/s; `tests.synthetic_flight.test_weather` compares with published jets. Model: Emmert et al.,
 "NRLMSIS 2.1", J. Geophys. Res. Space Phys. 127, 2022, through pymsis (MIT); its output is a work of the United States
 Government. Balance: Fleming et al., "Zonal mean temperature, pressure, zonal wind and geopotential height as functions
-of latitude", Adv. Space Res. 10(12), 1990 (CIRA-86 was made so). Run: ``python mean_winds.py`` (needs ``msis``).
+of latitude", Adv. Space Res. 10(12), 1990 (CIRA-86 was made so). Run: ``python tools/mean_winds.py`` (needs ``msis``).
 """
 
 from __future__ import annotations
@@ -87,4 +87,5 @@ if __name__ == "__main__":
     for month in range(1, 13):
         for latitude in LATITUDE_DEG:
             lines.append(f"{month},{latitude:.0f}," + ",".join(f"{u:.0f}" for u in wind(month, latitude)))
-    Path(__file__).with_suffix(".csv").write_text("\n".join(lines) + "\n")
+    table = Path(__file__).parents[1] / "flightmodel" / "data" / "atmosphere" / "mean_winds.csv"
+    table.write_text("\n".join(lines) + "\n")

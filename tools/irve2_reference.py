@@ -4,7 +4,9 @@ C_A at zero angle: for Mach >= 2.5, 1.094 times modified Newtonian plus base dra
 0.3 % of published 60 deg sphere-cone values; below, own rounding of blunt-cone data. Its shape with angle, C_N and
 C_m: modified Newtonian (`flightmodel.sphere_cone`), C_N and C_m times k_N, which falls from 1.00 at Mach 5.7 to 0.45 at
 3.5 and below: the value that reconciles the seed paper with itself. C_mq: a family-shaped table for 60 to 70 deg
-capsules, unstable at small angles below Mach 3. None of it is IRVE-II's own data. Run: ``python irve2_reference.py``.
+capsules, unstable at small angles below Mach 3. None of it is IRVE-II's own data.
+
+Run: ``python tools/irve2_reference.py``.
 """
 
 from __future__ import annotations
@@ -69,6 +71,7 @@ def rows() -> np.ndarray:
 
 
 if __name__ == "__main__":
-    lines = ["# SYNTHETIC, see irve2_reference.py beside this file", "mach,alpha_deg,ca,cn,cm,cmq"]
+    lines = ["# SYNTHETIC, made by tools/irve2_reference.py", "mach,alpha_deg,ca,cn,cm,cmq"]
     lines += [f"{m:g},{a:g},{ca:.6f},{cn:.6f},{cm:.6f},{cmq:.4f}" for m, a, ca, cn, cm, cmq in rows() + 0.0]
-    Path(__file__).with_suffix(".csv").write_text("\n".join(lines) + "\n")
+    table = Path(__file__).parents[1] / "flightmodel" / "data" / "aerodynamics" / "irve2_reference.csv"
+    table.write_text("\n".join(lines) + "\n")

@@ -3,7 +3,7 @@
 NASA TN D-4183 (Scallion and Lewis, 1967), figure 4, to 80 deg angle of attack, through ytakahashi3123/Tacode (MIT);
 beyond, C_A and C_N are held and C_m goes to zero at 180 deg (no flight comes there). C_A is scaled by 1.5009 / 1.4766
 to the drag that NASA TN D-3569's trajectory has. Moments are about a station 0.029 m behind the c.g. C_mq: none is
-published; zero. Run: ``python fire2.py``.
+published; zero. Run: ``python tools/fire2.py``.
 """
 
 from __future__ import annotations
@@ -35,4 +35,5 @@ def rows() -> np.ndarray:
 if __name__ == "__main__":
     lines = ["# Project FIRE II, NASA TN D-4183 figure 4; made by fire2.py", "mach,alpha_deg,ca,cn,cm,cmq"]
     lines += [f"{mach},{a:g},{ca:.6f},{cn:.6f},{cm:.6f},0.0" for mach in (0, 35) for a, ca, cn, cm in rows()]
-    Path(__file__).with_suffix(".csv").write_text("\n".join(lines) + "\n")
+    table = Path(__file__).parents[1] / "flightmodel" / "data" / "aerodynamics" / "fire2.csv"
+    table.write_text("\n".join(lines) + "\n")

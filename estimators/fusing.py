@@ -14,7 +14,6 @@ each method, or a posterior in which the likeliest fault's inputs are as good as
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,9 +37,8 @@ from estimators.loads import MIN_AXIAL_MPS2, FlightLoads
 from estimators.misalignment import estimate_misalignment, misalignment_evidence
 from estimators.southwell import Limbs, southwell_limbs
 from estimators.trim import estimate_trim, trim_evidence
-from flightmodel.checks import DivergenceError, FloatArray, GateError
+from flightmodel.checks import Check, DivergenceError, FloatArray, GateError, Result
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
-from recon.consistency import ConsistencyCheck
 
 _METHODS: dict[str, Method] = {"misalignment": misalignment_evidence, "trim": trim_evidence}
 _FREED = 10.0  # times its stated sd an input is as good as unknown: a fault of two stated sd is a fifth of it
@@ -78,13 +76,13 @@ class CameraTimeBias:
 
 
 @dataclass(frozen=True)
-class FusedAnswer:
+class FusedAnswer(Fused):
     """Posterior of deflection and inputs, tests of the methods against each other, and the Southwell lines.
+
+    The posterior is that of the methods that are used; its history holds the mixture where there are alternatives.
 
     Parameters
     ----------
-    fused : Fused
-        Of the methods that are used; its history holds the mixture where there are alternatives.
     agreement : Agreement
         Of all methods.
     limbs : Limbs or None
@@ -98,7 +96,6 @@ class FusedAnswer:
         Of what the loads say, and the camera where it is not left out, whatever was made of their disagreement.
     """
 
-    fused: Fused
     agreement: Agreement
     limbs: Limbs | None
     limbs_remark: str
@@ -119,7 +116,7 @@ class FusedAnswer:
         return words
 
     @property
-    def consistency_checks(self) -> tuple[ConsistencyCheck, ...]:
+    def consistency_checks(self) -> tuple[Check, ...]:
         """Whether the methods agree, and whether the camera's time bias is what is stated.
 
         A time bias that is off comes first: what else the agreement suspects supposes that the frames' times are right.
@@ -133,13 +130,11 @@ class FusedAnswer:
         blamed = "camera" if is_late or self.left_out == "camera" else ", ".join(likeliest) or self.left_out or ""
         source = "" if passed else blamed
         name = "deflection methods agree: least chance of a pair"
-        checks = [
-            ConsistencyCheck("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)
-        ]
+        checks = [Check("deflection-methods", name, least, 1.0 - CONFIDENCE, 1.0, passed, self.remark, source)]
         if bias is not None and not bias.applied:
             size, source = abs(bias.offset_s) / bias.sd_s, "camera" if bias.is_off else ""
             name = "camera time bias over its sd"
-            clock = ConsistencyCheck("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
+            clock = Check("camera-time-bias", name, size, 0.0, _OFF_SD, not bias.is_off, bias.remark, source)
             checks.insert(0 if bias.is_off else 1, clock)
         return tuple(checks)
 
@@ -169,8 +164,8 @@ class FusedAnswer:
         Columns ``input, moved_sd, sd_left, correlation_with_deflection_y, correlation_with_deflection_z``.
         """
         rows = []
-        for k, (name, (mean, cov)) in enumerate(self.fused.inputs.items()):
-            rows.append((name, mean[0], np.sqrt(cov[0, 0]), *self.fused.correlation[2 + k, :2]))
+        for k, (name, (mean, cov)) in enumerate(self.inputs.items()):
+            rows.append((name, mean[0], np.sqrt(cov[0, 0]), *self.correlation[2 + k, :2]))
         names = ["input", "moved_sd", "sd_left", "correlation_with_deflection_y", "correlation_with_deflection_z"]
         return pd.DataFrame(rows, columns=names)
 
@@ -184,7 +179,7 @@ def fuse_flight(
     loads: FlightLoads,
     camera: DeflectionHistory | None,
     camera_time_bias_sd_s: float = 0.0,
-    tested: Callable[[], tuple[CameraTimeBias | None] | None] = lambda: None,
+    time_bias: Result[CameraTimeBias | None] | None = None,
 ) -> FusedAnswer:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
 
@@ -198,6 +193,8 @@ def fuse_flight(
     camera : DeflectionHistory or None
         With the benchmark frame taken as undeflected.
     camera_time_bias_sd_s : float
+    time_bias : Result, optional
+        `time_bias_if_free` of the same flight, where it is worked out elsewhere meanwhile.
 
     Raises
     ------
@@ -219,8 +216,9 @@ def fuse_flight(
     is_tested = observable and bias_sd_s == 0.0
 
     def bias() -> CameraTimeBias | None:
-        known = tested() if is_tested else (None,)
-        return _tested_time_bias(sources) if known is None else known[0]
+        if not is_tested:
+            return None
+        return _tested_time_bias(sources) if time_bias is None else time_bias.result()
 
     try:
         answer = sources.answer(sources.names, bias_sd_s)
@@ -299,10 +297,9 @@ class _Sources:
         stated = [moved_evidence(one, back, fused.deflection) for one in read(inputs, fused.deflection)]
         faults = fault_hypotheses(self.loads, fused.input_posterior, CAMERA_PLANE_SD_RAD)
         tests = agreement(stated, fused.input_posterior, fused.deflection, faults)
-        applied = CAMERA_TIME_BIAS in fused.inputs
-        return FusedAnswer(
-            fused, tests, *_limbs(fused, self.loads), _time_bias(fused, bias_sd_s, True) if applied else None
-        )
+        bias = _time_bias(fused, bias_sd_s, True) if CAMERA_TIME_BIAS in fused.inputs else None
+        limbs, remark = _limbs(fused.history, self.loads)
+        return FusedAnswer(**vars(fused), agreement=tests, limbs=limbs, limbs_remark=remark, camera_time_bias=bias)
 
     def tested(self, fault: DivergenceError, bias_sd_s: float) -> Agreement:
         """Test of all methods' agreement without a common answer."""
@@ -330,7 +327,7 @@ def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
     if not among:
         return None
     base = among.get("trim", next(iter(among.values())))
-    histories = {f"without {name}": answer.fused.history for name, answer in among.items()}
+    histories = {f"without {name}": answer.history for name, answer in among.items()}
     return _mixed(base, histories, np.ones(len(histories)), sources.loads)
 
 
@@ -350,13 +347,13 @@ def _of_either(sources: _Sources) -> FusedAnswer | None:
 
 def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float) -> FusedAnswer:
     """Mixture of the answer as stated and those without the likeliest faults' inputs, by their odds."""
-    histories, odds = {"all inputs as stated": answer.fused.history}, [1.0]
+    histories, odds = {"all inputs as stated": answer.history}, [1.0]
     for fault in answer.agreement.likeliest:
         try:
             freed = sources.answer(sources.names, bias_sd_s, HYPOTHESES[fault])
         except DivergenceError:
             continue
-        histories[f"another {fault}"] = freed.fused.history
+        histories[f"another {fault}"] = freed.history
         odds.append(float(np.exp(min(answer.agreement.gains[fault], _LARGEST_LOG))))
     return _mixed(answer, histories, np.array(odds), sources.loads) if len(odds) > 1 else answer
 
@@ -365,7 +362,7 @@ def _mixed(
     answer: FusedAnswer, histories: dict[str, DeflectionHistory], weights: FloatArray, loads: FlightLoads
 ) -> FusedAnswer:
     """Answer whose history is the mixture of several, at its own times; their differences are in the covariance."""
-    t, own = answer.fused.history.time_s, answer.fused.history
+    t, own = answer.history.time_s, answer.history
     yz, cov, weight = [], [], []
     for history, one in zip(histories.values(), weights / weights.sum(), strict=True):
         lateral_cov = history.lateral_cov_without_plane
@@ -381,9 +378,9 @@ def _mixed(
     mean = np.sum(share * np.array(yz), axis=0)
     apart = np.array(yz) - mean
     total = np.sum(share[..., None] * (np.array(cov) + apart[..., :, None] * apart[..., None, :]), axis=0)
-    fused = replace(answer.fused, history=history_from_lateral(t, mean, total, own.method, own.assumptions))
-    limbs, remark = _limbs(fused, loads)
-    return replace(answer, fused=fused, limbs=limbs, limbs_remark=remark, alternatives=tuple(histories))
+    history = history_from_lateral(t, mean, total, own.method, own.assumptions)
+    limbs, remark = _limbs(history, loads)
+    return replace(answer, history=history, limbs=limbs, limbs_remark=remark, alternatives=tuple(histories))
 
 
 def _explained(
@@ -395,12 +392,12 @@ def _explained(
     return DivergenceError(f"{bias.cause}: with it there is a common answer; {fault}", code="camera-time-bias")
 
 
-def _limbs(fused: Fused, loads: FlightLoads) -> tuple[Limbs | None, str]:
+def _limbs(history: DeflectionHistory, loads: FlightLoads) -> tuple[Limbs | None, str]:
     """Southwell lines of the fused history, and a remark."""
     peak = int(np.argmax(loads.dynamic_pressure_pa))
     pressure_sd = float(loads.dynamic_pressure_sd_pa[peak] / loads.dynamic_pressure_pa[peak])
     try:
-        limbs = southwell_limbs(fused.history, loads.time_s, loads.dynamic_pressure_pa, pressure_sd)
+        limbs = southwell_limbs(history, loads.time_s, loads.dynamic_pressure_pa, pressure_sd)
     except DivergenceError as fault:
         return None, str(fault)
     return limbs, limbs.remark
