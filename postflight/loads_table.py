@@ -27,15 +27,20 @@ import pandas as pd
 from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, LoadsColumns, LoadsErrors, loads_from_arrays
 from flightmodel.airdata import lateral_angles
 from flightmodel.atmosphere import sound_speed, us76
-from flightmodel.checks import Fault, FloatArray, GateError, nearest_name
+from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.config import parse_section
 from flightmodel.deflection import lv_direction
+from flightmodel.files import write_file
 from flightmodel.tables import read_unit, to_si
 from flightmodel.vehicle import Vehicle, read_vehicle
 from postflight.intake.column_recognition import Recogniser, SourceProposal, column_unit
 from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import ColumnName
 from postflight.intake.stored_tables import read_tables
+from postflight.run_folder import DIGITS
+from postflight.terminal import terminal
+
+console = terminal()
 
 
 class _Meaning(NamedTuple):
@@ -76,14 +81,14 @@ class _Columns:
 
     label: str
     values: dict[str, FloatArray] = field(default_factory=dict)
-    faults: list[Fault] = field(default_factory=list)
+    faults: list[Issue] = field(default_factory=list)
     open: set[str] = field(default_factory=set)  # found, with a fault
     unused: list[str] = field(default_factory=list)
 
     def refuse(self, short: str, words: str, code: str) -> None:
         """Keep what is wrong with a quantity's column."""
         self.open.add(short)
-        self.faults.append(Fault(f"{self.label}: {words}", code))
+        self.faults.append(Issue(f"{self.label}: {words}", code))
 
     def has(self, *names: str) -> bool:
         """Whether all of them were found."""
@@ -127,14 +132,19 @@ def read_loads(
     GateError
         With every column that is missing or whose unit is open, or where columns contradict each other.
     """
-    source = _as_table(table)
     stated = parse_section(LoadsErrors, errors, "read_loads")
     made = vehicle if isinstance(vehicle, Vehicle) else read_vehicle(vehicle)
-    arm = _cg_from_sensor(made, acceleration_at)
-    found = _read(source, dict(columns or {}))
-    loads = loads_from_arrays(made, _columns(found), stated, arm)
+    return _loads(table, made, dict(columns or {}), _cg_from_sensor(made, acceleration_at), stated)[0]
+
+
+def _loads(
+    table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: dict[str, str], arm_m: FloatArray, errors: LoadsErrors
+) -> tuple[FlightLoads, list[str]]:
+    """Loads, and the names of the table's columns that were not used."""
+    found = _read(_as_table(table), columns)
+    loads = loads_from_arrays(vehicle, _columns(found), errors, arm_m)
     _check(found.label, loads)
-    return loads
+    return loads, found.unused
 
 
 def _as_table(table: str | Path | pd.DataFrame) -> FreeFormTable:
@@ -157,7 +167,7 @@ def _cg_from_sensor(vehicle: Vehicle, at: str | tuple[float, float, float]) -> F
         if at not in vehicle.sensors:
             known = ", ".join(("cg", *vehicle.sensors))
             words = f"acceleration_at '{at}'{nearest_name(at, vehicle.sensors)}: known are {known}, or a place"
-            raise GateError(words, "mount-unknown")
+            raise GateError(words, "name-unknown")
         at = vehicle.sensors[at].position_from_datum_body_m
     return np.asarray(vehicle.cg_m - np.asarray(at, dtype=float))
 
@@ -286,7 +296,7 @@ def _columns(found: _Columns) -> LoadsColumns:
         missing.append("two of mach, dynamic_pressure and airspeed")
     if missing:
         words = f'{found.label}: no column of {", ".join(missing)}; state which it is, as columns={{"ax": "NAME:UNIT"}}'
-        faults.append(Fault(words, "column-missing"))
+        faults.append(Issue(words, "column-missing"))
     if faults:
         raise GateError(faults)
     _complete(values)
@@ -356,7 +366,7 @@ def _check(label: str, loads: FlightLoads) -> None:
         ("the axial force", _axial_ratio(at), "of the vehicle's C_A S q / m", _AXIAL_FACTOR),
     )
     faults = [
-        Fault(f"{label}: {words} is {middle:.3g} {of}; check the units of these columns", "units-and-signs")
+        Issue(f"{label}: {words} is {middle:.3g} {of}; check the units of these columns", "units-and-signs")
         for words, ratio, of, most in compared
         if not 1.0 / most < (middle := float(np.median(ratio))) < most
     ]
@@ -371,3 +381,36 @@ def _axial_ratio(loads: FlightLoads) -> FloatArray:
     axial = np.array([vehicle.aero.at(m, a)[0] for m, a in zip(loads.mach, angle, strict=True)])
     force = axial * vehicle.reference.area_m2 * loads.dynamic_pressure_pa / vehicle.mass_kg
     return np.asarray(-loads.specific_force_body_mps2[:, 0] / force)
+
+
+# the command
+
+
+def deflection_of_table(
+    table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], errors: tuple[str, ...], place: str
+) -> None:
+    """Estimate, print, and write a table a method beside the table of loads, in ``<stem>-deflection``."""
+    from postflight.commands import asked, compile_kernels, print_answers
+    from postflight.deflections import METHODS, estimate
+
+    pairs = dict(text.partition("=")[::2] for text in columns)
+    made, stated = read_vehicle(vehicle), parse_section(LoadsErrors, asked(errors, (), None).changes, "--set")
+    loads, unused = _loads(table, made, pairs, _cg_from_sensor(made, place), stated)
+    compile_kernels("balance")
+    answers = estimate(loads, methods or tuple(name for name in METHODS if name != "camera"))
+    folder = table.with_name(f"{table.stem}-deflection")
+    folder.mkdir(exist_ok=True)
+    for method, history in answers.histories.items():
+        content = history.to_frame().to_csv(index=False, float_format=DIGITS, lineterminator="\n")
+        write_file(folder / f"deflection_{method}.csv", content)
+    print_answers(answers)
+    console.print(
+        f"{len(loads.time_s)} rows of {table}; not stated there: {', '.join(_defaults(errors))}", markup=False
+    )
+    console.print(f"tables in {folder}", markup=False)
+
+
+def _defaults(stated: tuple[str, ...]) -> list[str]:
+    """Errors that the defaults stand for, as ``--set`` takes them."""
+    said = {text.partition("=")[0].strip() for text in stated}
+    return [f"{key} = {value}" for key, value in LoadsErrors().model_dump().items() if key not in said and value]
