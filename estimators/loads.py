@@ -2,6 +2,11 @@
 
 Motion of the centerbody and the flow that it met, on one time grid, made from a best-estimated trajectory (BET) and
 corrected sensors; it holds no truth. Lateral vectors are in body y, z.
+
+`loads_from_arrays` makes them from another team's trajectory. Force and rate are then means over half windows ``h`` to
+both sides of an even grid, and the angular acceleration is the difference of the rate's means after and before over
+``2 h``. Of a table no denser than the grid they are its samples, and a cubic spline's derivative. White noise is
+measured by fourth differences, which a motion below a tenth of the sampling rate hardly enters.
 """
 
 from __future__ import annotations
@@ -11,14 +16,21 @@ from typing import Any
 
 import numpy as np
 
+from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import BoolArray, FloatArray, check_shape
+from flightmodel.checks import BoolArray, FloatArray, GateError, check_finite, check_increasing, check_shape
+from flightmodel.config import ErrorAngle, NonNegative, Section
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.vehicle import Vehicle
 
 # below this axial deceleration the ratio of forces and the moment balance carry no information
 MIN_AXIAL_MPS2 = 0.3 * STANDARD_GRAVITY_MPS2
 _POINTS = ("point_from_datum_m", "cg_from_sensor_m")  # arrays that are no histories
+SLOPE_AT_RAD = np.deg2rad(2.0)  # where the coefficients' slopes by alpha are taken
+GRID_HZ = 20.0  # of loads from a table: eight samples a period of a joint at 2.5 Hz
+LEAST_ROWS = 20  # for an answer with a history
+_DENSE = 1.5  # samples a step of the grid, from which they are averaged
+_FOURTH_DIFFERENCE_VAR = 70.0  # of white noise of variance 1: 1 + 16 + 36 + 16 + 1
 
 
 @dataclass(frozen=True)
@@ -139,3 +151,192 @@ def lateral_and_size(vectors_yz: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit vectors ``(n, 2)`` (zero for zero) and lengths ``(n,)``."""
     size = np.linalg.norm(vectors_yz, axis=-1)
     return vectors_yz / np.where(size > 0.0, size, 1.0)[..., None], size
+
+
+def pitching_radps(vehicle: Vehicle, mach: float, dynamic_pressure_pa: float, spin_radps: float) -> float:
+    """Rate, rad/s, at which transverse rates turn in body axes: rigid pitching at a dynamic pressure, and spin."""
+    _, normal, moment, _ = vehicle.aero.at(mach, SLOPE_AT_RAD) / SLOPE_AT_RAD
+    restoring_m = -(moment * vehicle.reference.length_m - normal * vehicle.cg_m[0])
+    inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
+    square = dynamic_pressure_pa * vehicle.reference.area_m2 * restoring_m / inertia
+    return float(np.sqrt(max(square, 0.0)) + abs(spin_radps))
+
+
+class LoadsErrors(Section):
+    """Standard deviations of what a table of loads does not state; each widens the answer.
+
+    The defaults are those of a good entry instrumentation: an accelerometer of 5 mg, gyros of 0.05 deg/s, a flow angle
+    known to 0.3 deg beside the wind, winds of a sounding of the day, a dynamic pressure known to 3 %. Noises that are
+    not stated are measured.
+    """
+
+    accelerometer_noise_sd_mps2: NonNegative | None = None
+    accelerometer_bias_sd_mps2: NonNegative = 0.05
+    accelerometer_scale_sd: NonNegative = 0.002
+    accelerometer_mount_sd_deg: ErrorAngle = 0.1
+    rate_noise_sd_degps: NonNegative | None = None
+    rate_bias_sd_degps: NonNegative = 0.05
+    rate_scale_sd: NonNegative = 0.002
+    flow_angle_sd_deg: ErrorAngle = 0.3
+    wind_sd_mps: NonNegative = 3.0
+    dynamic_pressure_sd_percent: NonNegative = 3.0
+    time_bias_sd_s: NonNegative = 0.001
+
+
+@dataclass(frozen=True)
+class LoadsColumns:
+    """What a table of another trajectory states, in SI units, body axes of the centerbody.
+
+    Parameters
+    ----------
+    time_s : (n,) float
+        Increasing.
+    specific_force_body_mps2 : (n, 3) float
+        Of the accelerometer, ``cg_from_sensor_m`` from the c.g.
+    rate_body_radps : (n, 3) float
+        Relative to inertial space.
+    flow_yz_rad : (n, 2) float
+        Total angle of attack as a lateral vector, relative to the air.
+    mach, dynamic_pressure_pa, airspeed_mps, altitude_m : (n,) float
+    flow_sd_rad : (n,) float, optional
+        Of each component of the flow, wind included; else by `LoadsErrors`.
+    dynamic_pressure_sd_pa : (n,) float, optional
+    wind_sd_mps : (n,) float, optional
+    """
+
+    time_s: FloatArray
+    specific_force_body_mps2: FloatArray
+    rate_body_radps: FloatArray
+    flow_yz_rad: FloatArray
+    mach: FloatArray
+    dynamic_pressure_pa: FloatArray
+    airspeed_mps: FloatArray
+    altitude_m: FloatArray
+    flow_sd_rad: FloatArray | None = None
+    dynamic_pressure_sd_pa: FloatArray | None = None
+    wind_sd_mps: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes, numbers and the order of times once."""
+        n = len(self.time_s)
+        widths = {"specific_force_body_mps2": (3,), "rate_body_radps": (3,), "flow_yz_rad": (2,)}
+        for field_ in fields(self):
+            value = getattr(self, field_.name)
+            if value is not None:
+                name = f"loads.{field_.name}"
+                check_finite(name, check_shape(name, value, (n, *widths.get(field_.name, ()))))
+        check_increasing("loads.time_s", self.time_s)
+
+
+def loads_from_arrays(
+    vehicle: Vehicle,
+    stated: LoadsColumns,
+    errors: LoadsErrors | None = None,
+    cg_from_sensor_m: FloatArray | None = None,
+) -> FlightLoads:
+    """Loads of a flight whose trajectory somebody else made.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        Pre-flight model.
+    stated : LoadsColumns
+    errors : LoadsErrors, optional
+        Of what is not stated; the defaults else.
+    cg_from_sensor_m : (3,) float, optional
+        From the accelerometer to the c.g. of the undeflected vehicle, body axes; at the c.g. without.
+
+    Raises
+    ------
+    GateError
+        ``too-few-data`` with fewer than 20 rows.
+    """
+    if len(stated.time_s) < LEAST_ROWS:
+        raise GateError(f"loads: {len(stated.time_s)} rows; at least {LEAST_ROWS} are wanted", "too-few-data")
+    errors = errors or LoadsErrors()
+    arm = np.zeros(3) if cg_from_sensor_m is None else np.asarray(cg_from_sensor_m, dtype=float)
+    t, h, force, rate, turn = _on_grid(stated)
+
+    def at(values: FloatArray) -> FloatArray:
+        return np.column_stack([np.interp(t, stated.time_s, column) for column in np.atleast_2d(values.T)])
+
+    mach, pressure, airspeed, altitude = (
+        at(column)[:, 0] for column in (stated.mach, stated.dynamic_pressure_pa, stated.airspeed_mps, stated.altitude_m)
+    )
+    samples = max(1.0, 2.0 * h / float(np.median(np.diff(stated.time_s))))
+    noise = errors.accelerometer_noise_sd_mps2
+    noise = white_noise_sd(stated.specific_force_body_mps2) if noise is None else noise
+    rate_noise = errors.rate_noise_sd_degps
+    rate_noise = white_noise_sd(stated.rate_body_radps) if rate_noise is None else np.deg2rad(rate_noise)
+    wind_mps = errors.wind_sd_mps if stated.wind_sd_mps is None else at(stated.wind_sd_mps)[:, 0]
+    wind = wind_mps / np.maximum(airspeed, 1.0)
+    alone = np.hypot(np.deg2rad(errors.flow_angle_sd_deg), wind)
+    flow_sd = alone if stated.flow_sd_rad is None else at(stated.flow_sd_rad)[:, 0]
+    given, part = stated.dynamic_pressure_sd_pa, 0.01 * errors.dynamic_pressure_sd_percent
+    pressure_sd = part * pressure if given is None else at(given)[:, 0]
+    force_root, rate_root = _sensor_roots(force, rate, errors)
+    peak = int(np.argmax(pressure))
+    return FlightLoads(
+        time_s=t,
+        specific_force_body_mps2=force + rotations.lever_arm_acceleration(rate, turn, arm),
+        force_noise_sd_mps2=noise / np.sqrt(samples),
+        force_root_mps2=force_root,
+        flow_root_rad=np.zeros((len(t), 2, force_root.shape[2])),
+        rate_root_radps=rate_root,
+        rate_body_radps=rate,
+        angular_acceleration_body_radps2=turn,
+        angular_acceleration_sd_radps2=float(np.sqrt(2.0 / samples) * rate_noise / (2.0 * h)),
+        flow_yz_rad=at(stated.flow_yz_rad),
+        flow_cov=flow_sd[:, None, None] ** 2 * np.eye(2),
+        wind_flow_sd_rad=np.minimum(wind, flow_sd),
+        altitude_m=altitude,
+        mach=mach,
+        dynamic_pressure_pa=pressure,
+        dynamic_pressure_sd_pa=pressure_sd,
+        airspeed_mps=airspeed,
+        vehicle=vehicle,
+        point_from_datum_m=vehicle.cg_m,
+        accelerometer_time_bias_sd_s=errors.time_bias_sd_s,
+        gyro_time_bias_sd_s=errors.time_bias_sd_s,
+        cg_from_sensor_m=arm,
+        half_window_s=h,
+        swing_radps=pitching_radps(vehicle, float(mach[peak]), float(pressure[peak]), float(rate[peak, 0])),
+    )
+
+
+def white_noise_sd(values: FloatArray) -> float:
+    """Standard deviation of the white noise of even samples (n, k), all columns together, by fourth differences."""
+    fourth = np.diff(values, n=4, axis=0)
+    scatter = np.median(np.abs(fourth)) / 0.6745  # of a normal variable: the motion's peaks do not count
+    return float(scatter / np.sqrt(_FOURTH_DIFFERENCE_VAR))
+
+
+def _on_grid(stated: LoadsColumns) -> tuple[FloatArray, float, FloatArray, FloatArray, FloatArray]:
+    """Times (m,), half window s, force, rate and angular acceleration (m, 3) on an even grid."""
+    from scipy.interpolate import CubicSpline
+
+    t, step = stated.time_s, float(np.median(np.diff(stated.time_s)))
+    force, rate = stated.specific_force_body_mps2, stated.rate_body_radps
+    if step * GRID_HZ * _DENSE > 1.0:
+        return t, 0.5 * step, force, rate, np.asarray(CubicSpline(t, rate)(t, 1))
+    h = 0.5 / GRID_HZ
+    at = np.arange(np.ceil((t[0] + 2.0 * h) * GRID_HZ), np.floor((t[-1] - 2.0 * h) * GRID_HZ) + 1.0) / GRID_HZ
+    sums = [CubicSpline(t, values).antiderivative() for values in (force, rate)]
+
+    def mean(k: int, low: FloatArray, high: FloatArray) -> FloatArray:
+        return np.asarray((sums[k](high) - sums[k](low)) / (high - low)[:, None])
+
+    turn = (mean(1, at, at + 2.0 * h) - mean(1, at - 2.0 * h, at)) / (2.0 * h)
+    return at, h, mean(0, at - h, at + h), mean(1, at - h, at + h), turn
+
+
+def _sensor_roots(force: FloatArray, rate: FloatArray, errors: LoadsErrors) -> tuple[FloatArray, FloatArray]:
+    """Errors of force and rate (n, 3, 15) per unit normal: accelerometer's bias, scale, mount; gyros' bias, scale."""
+    axes, n = np.eye(3), len(force)
+    force_root, rate_root = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
+    force_root[:, :, 0:3] = errors.accelerometer_bias_sd_mps2 * axes
+    force_root[:, :, 3:6] = errors.accelerometer_scale_sd * force[:, :, None] * axes
+    force_root[:, :, 6:9] = np.deg2rad(errors.accelerometer_mount_sd_deg) * rotations.skew(force)
+    rate_root[:, :, 9:12] = np.deg2rad(errors.rate_bias_sd_degps) * axes
+    rate_root[:, :, 12:15] = errors.rate_scale_sd * rate[:, :, None] * axes
+    return force_root, rate_root

@@ -44,7 +44,7 @@ from estimators.evidence import (
     history_of_evidence,
     moved_vehicle,
 )
-from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, lateral_and_size
+from estimators.loads import MIN_AXIAL_MPS2, SLOPE_AT_RAD, FlightLoads, lateral_and_size
 from estimators.misalignment import misalignment_evidence
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.checks import FloatArray, GateError
@@ -57,7 +57,6 @@ LIMIT_RAD = np.deg2rad(30.0)  # far beyond the trim of an entry that keeps its h
 _AVERAGED_S = 1.0
 _ITERATIONS, _STEP_RAD = 5, 1e-4
 _NODE = np.sqrt(3.0)  # outer nodes of the three-point Gauss-Hermite rule, sd
-SLOPE_AT_RAD = np.deg2rad(2.0)  # where the static trim takes the coefficients' slopes by alpha
 _ASSUMPTIONS = (
     "moment balance about the c.g. with measured angular acceleration; pre-flight coefficients and c.g. offset; joint "
     f"as in the vehicle file; no answer below {MIN_AXIAL_MPS2 / STANDARD_GRAVITY_MPS2:.1f} g axial"

@@ -5,6 +5,7 @@
     flight = pf.read_flight("my-flight")        # telemetry behind the gate
     bet = pf.reconstruct(flight)                # best-estimated trajectory, air data, consistency checks
     answer = pf.fuse(bet)                       # the deflection by every method, and fused
+    answer = pf.fuse(pf.read_loads("bet.csv", "vehicle.toml"))  # the same on another team's trajectory
     changed = flight.with_(c_n=1.1, wind=None)  # a what-if is a changed flight
 
 Every result prints itself in one line, shows as a table in a notebook, and gives its data by ``to_frame()`` with units
@@ -32,6 +33,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from estimators.loads import FlightLoads
     from flightmodel.checks import GateError
     from flightmodel.deflection import DeflectionHistory
     from flightmodel.trajectory import Trajectory
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
     from postflight.flight import Flight, read_flight
     from postflight.flown_coefficients import AeroIncrements
     from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
+    from postflight.loads_table import read_loads
     from postflight.reconciliation.command import reconcile
     from postflight.reconstruction import Reconstruction, air_data, reconstruct
     from recon.settings import Settings
@@ -63,6 +66,8 @@ _DOOR = {
         "postflight.reconstruction": "reconstruct Reconstruction air_data",
         "recon.settings": "Settings",
         "flightmodel.trajectory": "Trajectory",
+        "postflight.loads_table": "read_loads",
+        "estimators.loads": "FlightLoads",
         "postflight.deflections": "Deflections aero_increments estimate_camera estimate_misalignment estimate_trim "
         "fuse",
         "postflight.flown_coefficients": "AeroIncrements",
@@ -79,6 +84,7 @@ __all__ = [
     "DeflectionHistory",
     "Deflections",
     "Flight",
+    "FlightLoads",
     "GateError",
     "Reconstruction",
     "Settings",
@@ -94,6 +100,7 @@ __all__ = [
     "monte_carlo",
     "plots",
     "read_flight",
+    "read_loads",
     "read_scenario",
     "read_vehicle",
     "reconcile",

@@ -294,7 +294,7 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 
 
 @cli.command()
-@click.argument("folder", type=FOLDER)
+@click.argument("folder", type=FOLDER, required=False)
 @click.option(
     "--method", "methods", type=NamedChoice(["camera", "misalignment", "trim", "fused"]), multiple=True,
     help="Estimator to run; repeat for several. Default: all that the flight has data for.",
@@ -307,11 +307,28 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
     "--joint", type=FiniteRange(0.0), help="Assume the joint this far aft of the nose, m; default: the vehicle file's."
 )
 @click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
-def deflection(folder: Path, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool) -> None:
-    """Estimate how far the aeroshell deflected in the flight in FOLDER."""
+@click.option("--loads", metavar="TABLE", help="Instead of FOLDER: another team's trajectory, accelerations and rates.")
+@click.option("--vehicle", metavar="FILE", help="Vehicle file, or the name of a shipped vehicle, for --loads.")
+@click.option("--column", "columns", multiple=True, metavar="NAME=COLUMN[:UNIT]", help="Of --loads: ax='AX (g)'.")
+@click.option("--set", "errors", multiple=True, metavar="KEY=VALUE", help="Of --loads: flow_angle_sd_deg=0.5, ...")
+@click.option("--at", "place", default="cg", help="Of --loads: where the accelerometer is: cg, or a vehicle's package.")
+def deflection(
+    folder: Path | None, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool,
+    loads: str | None, vehicle: str | None, columns: tuple[str, ...], errors: tuple[str, ...], place: str,
+) -> None:  # fmt: skip
+    """Estimate how far the aeroshell deflected in the flight in FOLDER, or by a table of loads (--loads, --vehicle)."""
     from postflight import commands
 
-    commands.deflection(folder, methods, plane, joint, film)
+    if (folder is None) == (loads is None):
+        raise click.UsageError("name a flight folder, or --loads TABLE with --vehicle FILE")
+    if folder is not None:
+        commands.deflection(folder, methods, plane, joint, film)
+    elif vehicle is None or loads is None:
+        raise click.UsageError("--loads wants --vehicle FILE: mass properties and coefficients")
+    else:
+        from postflight.loads_table import deflection_of_table
+
+        deflection_of_table(Path(loads), vehicle, methods, columns, errors, place)
 
 
 @cli.command()

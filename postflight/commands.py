@@ -461,9 +461,9 @@ def print_answers(answers: Deflections) -> None:
     at_s = answers.reference_s
     cycle = answers.cycle_s
     parts = [] if cycle is None else [f"mean over the cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s"]
-    parts.append("largest of the pulse" if answers.bet is not None else "largest")
+    parts.append("largest of the pulse" if answers.knows_peak else "largest")
     if np.isfinite(at_s):
-        note = "peak q" if answers.bet is not None else "its largest; no trajectory was made"
+        note = "peak q" if answers.knows_peak else "its largest; no trajectory was made"
         parts.append(f"at {at_s:.2f} s ({note})")
     table = Table(title=f"Deflection of the aeroshell against the centerbody, deg: {', '.join(parts)}; plane in deg LV")
     means = () if cycle is None else ("mean",)

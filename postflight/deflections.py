@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from estimators.loads import FlightLoads
+from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
+from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
-from postflight.flight import READ, RECONSTRUCT, Flight
+from postflight.flight import NO_VIDEO, READ, RECONSTRUCT, Flight
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
 from recon.consistency import doubt
@@ -23,6 +26,7 @@ if TYPE_CHECKING:  # estimators are a quarter of a second to import, for command
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
 
+LOADS = f"{RECONSTRUCT} or pf.read_loads(table, vehicle)"
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
 NO_COMMON_ANSWER = ("inputs-far-off", "not-converged", "camera-time-bias", "not-observable")
@@ -45,7 +49,9 @@ class Deflections(Tabular):
     camera : CameraAnswer or None
         What stands behind the camera's, of one camera or several, and its answer at any time.
     bet : Reconstruction or None
-        What they were made from; None where the camera answered without a trajectory.
+        What they were made from; None where the camera answered without a trajectory, or ``loads`` did.
+    loads : FlightLoads or None
+        What they were made from instead, of another team's trajectory (`read_loads`).
     increments : AeroIncrements or None
         Of the aerodynamic coefficients, where they were asked for (`with_increments`); ``no_increments`` says why not.
     no_increments : Issue or None
@@ -56,6 +62,7 @@ class Deflections(Tabular):
     fused: FusedAnswer | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
+    loads: FlightLoads | None = field(default=None, compare=False)
     increments: AeroIncrements | None = field(default=None, compare=False)
     no_increments: Issue | None = None
 
@@ -78,10 +85,17 @@ class Deflections(Tabular):
         return None if self.camera is None or "camera" not in self.histories else self.camera.smooth
 
     @property
+    def knows_peak(self) -> bool:
+        """Whether a trajectory, of this program or another, gives the time of peak dynamic pressure."""
+        return self.bet is not None or self.loads is not None
+
+    @property
     def reference_s(self) -> float:
         """Time at which methods are compared, s: peak dynamic pressure, else the first history's largest deflection."""
         if self.bet is not None:
             return self.bet.peak_s
+        if self.loads is not None:
+            return find_peak(self.loads.time_s, self.loads.dynamic_pressure_pa)[0]
         return next((float(h.time_s[h.largest()]) for h in self.histories.values()), float("nan"))
 
     @property
@@ -90,6 +104,9 @@ class Deflections(Tabular):
 
         Where there is hardly a load the largest answer is that of the largest noise.
         """
+        if self.loads is not None:
+            inside = self.loads.time_s[pressure_pulse(self.loads.dynamic_pressure_pa)]
+            return float(inside[0]), float(inside[-1])
         return (-np.inf, np.inf) if self.bet is None else self.bet.pulse_s
 
     @property
@@ -226,8 +243,13 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
 
 
 @on_one_thread
-def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
+def estimate_misalignment(flown: Reconstruction | FlightLoads) -> DeflectionHistory:
     """Deflection that reconciles the accelerometers with the trajectory, seed paper eqs. [1] to [4].
+
+    Parameters
+    ----------
+    flown : Reconstruction or FlightLoads
+        From `reconstruct`, or from `read_loads` of another team's trajectory.
 
     Raises
     ------
@@ -236,13 +258,17 @@ def estimate_misalignment(bet: Reconstruction) -> DeflectionHistory:
     """
     from estimators import misalignment
 
-    check_type("estimate_misalignment", bet, Reconstruction, RECONSTRUCT)
-    return misalignment.estimate_misalignment(bet.required_loads())
+    return misalignment.estimate_misalignment(_loads_of("estimate_misalignment", flown))
 
 
 @on_one_thread
-def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
+def estimate_trim(flown: Reconstruction | FlightLoads) -> DeflectionHistory:
     """Deflection whose c.g. offset trims the vehicle at the angle it flew, seed paper eqs. [5] and [6].
+
+    Parameters
+    ----------
+    flown : Reconstruction or FlightLoads
+        From `reconstruct`, or from `read_loads` of another team's trajectory.
 
     Raises
     ------
@@ -251,17 +277,17 @@ def estimate_trim(bet: Reconstruction) -> DeflectionHistory:
     """
     from estimators import trim
 
-    check_type("estimate_trim", bet, Reconstruction, RECONSTRUCT)
-    return trim.estimate_trim(bet.required_loads())
+    return trim.estimate_trim(_loads_of("estimate_trim", flown))
 
 
 @on_one_thread
-def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
+def fuse(flown: Reconstruction | FlightLoads, progress: Progress | None = None) -> Deflections:
     """Deflection by every method that the flight has data for, and one posterior of them all.
 
     Parameters
     ----------
-    bet : Reconstruction
+    flown : Reconstruction or FlightLoads
+        From `reconstruct`, or from `read_loads` of another team's trajectory.
     progress : callable, optional
 
     Returns
@@ -269,13 +295,22 @@ def fuse(bet: Reconstruction, progress: Progress | None = None) -> Deflections:
     Deflections
         ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
     """
-    check_type("fuse", bet, Reconstruction, RECONSTRUCT)
-    wanted = tuple(m for m in METHODS if m != "camera" or bet.telemetry.frames is not None)
-    return estimate(bet, wanted, progress)
+    check_type("fuse", flown, (Reconstruction, FlightLoads), LOADS)
+    has_film = isinstance(flown, Reconstruction) and flown.telemetry.frames is not None
+    return estimate(flown, tuple(m for m in METHODS if m != "camera" or has_film), progress)
+
+
+def _loads_of(name: str, flown: Reconstruction | FlightLoads | None) -> FlightLoads:
+    """Loads that a public function was given, or those of its reconstruction."""
+    if isinstance(flown, FlightLoads):
+        return flown
+    check_type(name, flown, (Reconstruction, FlightLoads), LOADS)
+    assert flown is not None
+    return flown.required_loads()
 
 
 def estimate(
-    flown: Flight | Reconstruction,
+    flown: Flight | Reconstruction | FlightLoads,
     methods: tuple[str, ...],
     progress: Progress | None = None,
     camera: Result[CameraAnswer] | None = None,
@@ -283,38 +318,46 @@ def estimate(
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone. The result of ``camera`` is the camera's answer,
-    where it is worked out elsewhere meanwhile, and that of ``time_bias`` the test of the camera's time bias.
+    A `Flight` without a trajectory has an answer of the camera alone, loads have those of the other methods. The result
+    of ``camera`` is the camera's answer, where it is worked out elsewhere meanwhile, and that of ``time_bias`` the test
+    of the camera's time bias.
     """
     report = progress or (lambda _fraction, _what: None)
-    flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
-    answers = Deflections(bet=bet)
+    bet = flown if isinstance(flown, Reconstruction) else None
+    loads = flown if isinstance(flown, FlightLoads) else None
+    flight = flown if isinstance(flown, Flight) else None if bet is None else bet.flight
+    answers = Deflections(bet=bet, loads=loads)
     fused, filmed = None, None
     for k, method in enumerate(sorted(methods, key=_AS_RUN.index)):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method == "camera":
+                if flight is None:
+                    raise GateError(
+                        "camera: a table of loads has no film; `[frames]` of a flight folder does", NO_VIDEO
+                    )
                 from postflight.filming import camera_answer, keep_oriented
 
                 shown = part_of(report, k / len(methods), (k + 1) / len(methods))
                 filmed = camera_answer(flight, bet, shown) if camera is None else camera.result()
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
-            elif bet is None:
-                raise GateError(f"{method}: needs a trajectory", "input-missing")
+            elif bet is None and loads is None:
+                raise GateError(f"{method}: needs a trajectory, or loads (pf.read_loads)", "input-missing")
             elif method == "misalignment":
-                history = estimate_misalignment(bet)
+                history = estimate_misalignment(_loads_of(method, bet or loads))
             elif method == "trim":
-                history = estimate_trim(bet)
+                history = estimate_trim(_loads_of(method, bet or loads))
             else:
                 from estimators.fusing import fuse_flight
 
                 # the fusion estimates the deflection at the benchmark itself
                 used = filmed is not None and "camera" in answers.histories
                 own = filmed.plain if filmed is not None and used else None
-                if own is None and "camera" not in answers.refused:
+                if own is None and flight is not None and "camera" not in answers.refused:
                     own = camera_for_fusion(flight)
-                fused = fuse_flight(bet.required_loads(), own, _time_bias_sd_s(flight), time_bias if used else None)
+                bias_sd_s = 0.0 if flight is None else _time_bias_sd_s(flight)
+                fused = fuse_flight(_loads_of("fuse", bet or loads), own, bias_sd_s, time_bias if used else None)
                 history = fused.history
         except GateError as fault:
             answers.refused[method] = Issue(str(fault), fault.codes[0])

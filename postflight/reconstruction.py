@@ -26,8 +26,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from estimators.loads import FlightLoads
-from estimators.trim import SLOPE_AT_RAD
+from estimators.loads import FlightLoads, pitching_radps
 from flightmodel import airdata, earth, rotations
 from flightmodel.airdata import AirData, angle_partials, derived_with_sd, euler_321, is_angle, lateral_angles
 from flightmodel.atmosphere import TOP_M, AtmosphereProfile, bottom_m, profile_from_sounding
@@ -606,12 +605,8 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
 def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> float:
     """Rate, rad/s, at which the transverse rates turn in body axes: rigid pitching at peak pressure, and spin there."""
     peak = int(np.nanargmax(air.dynamic_pressure_pa))
-    _, normal, moment, _ = vehicle.aero.at(air.mach[peak], SLOPE_AT_RAD) / SLOPE_AT_RAD
-    restoring_m = -(moment * vehicle.reference.length_m - normal * vehicle.cg_m[0])
-    inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
-    square = air.dynamic_pressure_pa[peak] * vehicle.reference.area_m2 * restoring_m / inertia
-    spin = np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0])
-    return float(np.sqrt(max(square, 0.0)) + abs(spin))
+    spin = float(np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0]))
+    return pitching_radps(vehicle, float(air.mach[peak]), float(air.dynamic_pressure_pa[peak]), spin)
 
 
 @dataclass(frozen=True)

@@ -292,7 +292,7 @@ class Recogniser:
         elif self.time is None:
             found = []
         else:
-            found = self._three_axis_sensors() + self._radar() + self._receiver() + self._barometer()
+            found = self.three_axis_sensors() + self._radar() + self._receiver() + self._barometer()
         for source in found:
             is_receiver = source.section.startswith("gnss.")
             source.time = self.fix_time if is_receiver and self.fix_time is not None else self.time
@@ -319,7 +319,7 @@ class Recogniser:
                 out.setdefault((stem, family), {}).setdefault(axis, k)
         return {key: by_axis for key, by_axis in out.items() if len(by_axis) == 3}
 
-    def _three_axis_sensors(self) -> list[SourceProposal]:
+    def three_axis_sensors(self) -> list[SourceProposal]:
         """Accelerometer, gyros, magnetometer."""
         found: dict[str, SourceProposal] = {}
         for (stem, family), by_axis in self._families().items():

@@ -1,0 +1,146 @@
+"""Estimators on a table of another trajectory program: columns as they are written, and the answers of the run."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import postflight as pf
+from flightmodel.airdata import pressure_pulse
+from flightmodel.vehicle import read_vehicle
+from postflight import commands
+from postflight.loads_table import read_loads
+from tests.postflight.short_flights import write_pulse
+from tests.refusing import refuses
+
+FOOT, PSF, G = 0.3048, 47.88026, 9.80665
+METHODS = ("misalignment", "trim")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Run folder of a synthetic pulse without film."""
+    folder = tmp_path_factory.mktemp("loads")
+    path = write_pulse(folder / "pulse.toml")
+    path.write_text(re.sub(r"(?ms)^\[video\].*?(?=^\[)", "", path.read_text()))
+    commands.simulate(str(path), folder / "flight", 5, force=False)
+    _, _, written = commands.run_flight(folder / "flight", (*METHODS, "fused"), commands.Asked())
+    return written
+
+
+@pytest.fixture(scope="module")
+def bet(run):
+    return pd.read_csv(run / "bet.csv")
+
+
+@pytest.fixture
+def alien(bet):
+    """The trajectory as another team's program would write it."""
+    return pd.DataFrame(
+        {
+            "TIME (s)": bet.t_s,
+            **{f"A{a.upper()} (g)": bet[f"a{a}_cg_mps2"] / G for a in "xyz"},
+            **{f"{a.upper()} (deg/s)": bet[f"{a}_body_degps"] for a in "pqr"},
+            "MACH": bet.mach,
+            "QBAR (psf)": bet.dynamic_pressure_pa / PSF,
+            "ALPHA (deg)": bet.alpha_deg,
+            "BETA (deg)": bet.beta_deg,
+            "ALT (kft)": bet.alt_m / (1000.0 * FOOT),
+            "VTAS (ft/s)": bet.airspeed_mps / FOOT,
+        }
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_runs_own_table_gives_its_answers(method, run):
+    """Means over the pulse: the table's accelerations are means over 0.1 s, those of the run's own loads over 0.04 s."""
+    loads = read_loads(run / "bet.csv", "irve2_reference")
+    history = getattr(pf, f"estimate_{method}")(loads)
+    own = pd.read_csv(run / f"deflection_{method}.csv")
+    at = loads.time_s[pressure_pulse(loads.dynamic_pressure_pa)]
+    theta, sd = np.rad2deg(np.array([history.at(t) for t in at]).T)
+    expected, stated = (np.interp(at, own.t_s, own[c]) for c in ("theta_deg", "theta_sd_deg"))
+    assert abs((theta - expected).mean()) < 0.1 * stated.mean()
+    assert np.abs(theta - expected).max() < 0.5 * stated.min()
+    assert 0.7 < sd.mean() / stated.mean() < 1.5
+
+
+def test_headers_of_another_program_are_recognised_with_their_units(alien, run):
+    own, other = read_loads(run / "bet.csv", "irve2_reference"), read_loads(alien, "irve2_reference")
+    for name in ("specific_force_body_mps2", "rate_body_radps", "flow_yz_rad", "mach", "dynamic_pressure_pa"):
+        np.testing.assert_allclose(getattr(other, name), getattr(own, name), rtol=1e-6, atol=1e-9)
+
+
+def test_angles_by_total_and_clock_are_those_by_alpha_and_beta(alien, bet, run):
+    other = alien.drop(columns=["ALPHA (deg)", "BETA (deg)"])
+    other["TOTAL ALPHA (deg)"], other["CLOCK (deg)"] = bet.alpha_total_wind_deg, bet.clock_lv_deg
+    flow = read_loads(other, "irve2_reference").flow_yz_rad
+    np.testing.assert_allclose(flow, read_loads(alien, "irve2_reference").flow_yz_rad, atol=1e-7)
+
+
+def test_units_that_the_header_leaves_open_are_asked_all_at_once_and_can_be_stated(alien):
+    bare = alien.rename(columns=lambda name: name.split(" (")[0])
+    with refuses("unit-unknown", names=["AX", "QBAR", "ALT", "VTAS"]):
+        read_loads(bare, "irve2_reference")
+    stated = {
+        "t": "TIME:s", "ax": "AX:g", "ay": "AY:g", "az": "AZ:g", "p": "P:degps", "q": "Q:degps", "r": "R:degps",
+        "dynamic_pressure": "QBAR:psf", "altitude": "ALT:kft", "airspeed": "VTAS:ftps", "alpha": "ALPHA:deg",
+        "beta": "BETA:deg",
+    }  # fmt: skip
+    loads = read_loads(bare, "irve2_reference", columns=stated)
+    np.testing.assert_allclose(loads.flow_yz_rad, read_loads(alien, "irve2_reference").flow_yz_rad)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "codes"),
+    [
+        ("VTAS (ft/s)", 1.0 / FOOT, {"units-and-signs"}),
+        ("QBAR (psf)", PSF, {"units-and-signs"}),
+        ("AX (g)", -1.0, {"deceleration-too-small"}),
+        ("MACH", 0.01, {"units-and-signs"}),
+    ],
+)
+def test_a_wrong_unit_or_sign_is_refused(column, factor, codes, alien):
+    alien[column] *= factor
+    with pytest.raises(pf.GateError) as caught:
+        read_loads(alien, "irve2_reference")
+    assert set(caught.value.codes) <= codes
+
+
+def test_what_is_missing_is_said(alien):
+    with refuses("column-missing", names=["beta"]):
+        read_loads(alien.drop(columns=["BETA (deg)"]), "irve2_reference")
+    with refuses("column-missing", names=["mach, dynamic_pressure and airspeed"]):
+        read_loads(alien.drop(columns=["QBAR (psf)", "MACH"]), "irve2_reference")
+
+
+def test_an_accelerometer_elsewhere_is_moved_to_the_cg(alien):
+    vehicle = read_vehicle("irve2_reference")
+    at_cg = read_loads(alien, vehicle)
+    away = read_loads(alien, vehicle, acceleration_at=tuple(vehicle.cg_m + np.array([0.5, 0.0, 0.0])))
+    moved = away.specific_force_body_mps2 - at_cg.specific_force_body_mps2
+    w = at_cg.rate_body_radps
+    # from the c.g. back over -0.5 m: w x (w x r) along x is 0.5 (q^2 + r^2)
+    np.testing.assert_allclose(moved[:, 0], 0.5 * (w[:, 1] ** 2 + w[:, 2] ** 2), atol=1e-9)
+
+
+def test_defaults_widen_the_answer_and_keys_replace_them(alien):
+    narrow = read_loads(alien, "irve2_reference", flow_angle_sd_deg=0.05, wind_sd_mps=0.5)
+    wide = read_loads(alien, "irve2_reference", flow_angle_sd_deg=1.0)
+    at = narrow.time_s[np.argmax(narrow.dynamic_pressure_pa)]
+    sds = [pf.estimate_misalignment(loads).at(at)[1] for loads in (narrow, wide)]
+    assert sds[1] > 2.0 * sds[0]
+    with refuses("key-unknown"):
+        read_loads(alien, "irve2_reference", flow_angle_deg=1.0)
+
+
+def test_fusion_takes_loads(alien, run):
+    loads = read_loads(alien, "irve2_reference")
+    answer = pf.fuse(loads)
+    frame = answer.to_frame().set_index("method")
+    assert {"misalignment", "trim", "fused"} <= set(frame.index)
+    own = pd.read_csv(run / "deflection_fused.csv")
+    at = frame.t_s["fused"]
+    expected, stated = (np.interp(at, own.t_s, own[c]) for c in ("theta_deg", "theta_sd_deg"))
+    assert abs(frame.theta_deg["fused"] - expected) < stated
