@@ -54,7 +54,7 @@ def alien(bet):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_runs_own_table_gives_its_answers(method, run):
-    """Means over the pulse: the table's accelerations are means over 0.1 s, those of the run's own loads over 0.04 s."""
+    """Means over the pulse: the table's accelerations are means over 0.1 s, those of the run's loads over 0.04 s."""
     loads = read_loads(run / "bet.csv", "irve2_reference")
     history = getattr(pf, f"estimate_{method}")(loads)
     own = pd.read_csv(run / f"deflection_{method}.csv")
@@ -130,7 +130,7 @@ def test_defaults_widen_the_answer_and_keys_replace_them(alien):
     wide = read_loads(alien, "irve2_reference", flow_angle_sd_deg=1.0)
     at = narrow.time_s[np.argmax(narrow.dynamic_pressure_pa)]
     sds = [pf.estimate_misalignment(loads).at(at)[1] for loads in (narrow, wide)]
-    assert sds[1] > 2.0 * sds[0]
+    assert sds[1] > 1.3 * sds[0]  # of a degree of the flow the force's tilt takes 0.12 deg, beside 0.13 deg of the rest
     with refuses("key-unknown"):
         read_loads(alien, "irve2_reference", flow_angle_deg=1.0)
 
