@@ -21,6 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import cached_property
 from itertools import count
 from multiprocessing.connection import wait
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from postflight.streams import THREAD_VARIABLES, pin_threads
@@ -30,13 +31,10 @@ _KEPT: dict[int, Any] = {}  # results of a worker process by the number of their
 
 
 @contextlib.contextmanager
-def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes with one thread of linear algebra each; what they still do at the end is stopped.
-
-    They are spawned: a fork copies locks that threads of this process may hold.
-    """
+def worker_pool(workers: int, start: str = "spawn") -> Iterator[ProcessPoolExecutor]:
+    """Processes with one thread of linear algebra each; what they still do at the end is stopped."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=_begin)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), initializer=_begin)
     pin_threads()
     try:
         yield pool
@@ -55,9 +53,19 @@ def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
+def _start() -> str:
+    """Return how a process starts: a fork where this thread is the only one, since a fork copies locks of others.
+
+    A fork has what this process loaded, which takes longer to load than a film to read.
+    """
+    threads = Path("/proc/self/task")  # those of libraries too; of Linux alone
+    return "fork" if threads.is_dir() and len(list(threads.iterdir())) == 1 else "spawn"
+
+
 def _begin() -> None:
     """Prepare a worker process: its parent handles Ctrl-C, and it ends with its parent, however that ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # a fork has the command's own
     parent = multiprocessing.parent_process()
     assert parent is not None
     sentinel = parent.sentinel
@@ -101,7 +109,7 @@ class Beside:
 
     def __init__(self) -> None:
         self._ending = contextlib.ExitStack()
-        self._pool = self._ending.enter_context(worker_pool(1))
+        self._pool = self._ending.enter_context(worker_pool(1, _start()))
         self._numbers = count()
 
     def __enter__(self) -> Beside:
