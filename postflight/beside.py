@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import pickle
 import pkgutil
 import signal
 import threading
@@ -21,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import cached_property
 from itertools import count
 from multiprocessing.connection import wait
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -134,7 +134,7 @@ class Beside:
 
     def _begun(self, task: Task[T], wanted: bool) -> Task[T]:
         # packed now: the pool would do so in a thread, while here what is computed on demand is added to arguments
-        job = pickle.dumps((task._work, task._arguments), pickle.HIGHEST_PROTOCOL)
+        job = bytes(ForkingPickler.dumps((task._work, task._arguments)))
         with contextlib.suppress(OSError, BrokenProcessPool):
             task.future = self._pool.submit(_answered, task._number, job, wanted)
         return task
@@ -158,7 +158,7 @@ def _answered(number: int, job: bytes, wanted: bool) -> tuple[Any, list[tuple[ty
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
         try:
-            _KEPT[number] = _call(*pickle.loads(job))
+            _KEPT[number] = _call(*ForkingPickler.loads(job))
         except Exception:
             return None
     return _KEPT[number] if wanted else None, [(one.category, str(one.message)) for one in given]

@@ -85,7 +85,7 @@ class _Columns:
     open: set[str] = field(default_factory=set)  # found, with a fault
     unused: list[str] = field(default_factory=list)
 
-    def refuse(self, short: str, words: str, code: str) -> None:
+    def leave_open(self, short: str, words: str, code: str) -> None:
         """Keep what is wrong with a quantity's column."""
         self.open.add(short)
         self.faults.append(Issue(f"{self.label}: {words}", code))
@@ -203,10 +203,12 @@ def _read_time(recogniser: Recogniser, chosen: dict[str, str], out: _Columns) ->
         return
     time = recogniser.time
     if time is None or time.format != "seconds":
-        out.refuse("t", 'no column of seconds; state it, as columns={"t": "TIME:s"}', "column-missing")
+        out.leave_open("t", 'no column of seconds; state it, as columns={"t": "TIME:s"}', "column-missing")
         return
     if not time.unit:
-        out.refuse("t", f'time: {time.why}; state its unit, as columns={{"t": "{time.columns[0]}:s"}}', "unit-unknown")
+        out.leave_open(
+            "t", f'time: {time.why}; state its unit, as columns={{"t": "{time.columns[0]}:s"}}', "unit-unknown"
+        )
         return
     values = recogniser.table.numbers(recogniser.table.names.index(time.columns[0]))
     out.values["t"] = to_si(values.copy(), time.unit)
@@ -216,14 +218,14 @@ def _read_stated(recogniser: Recogniser, short: str, text: str, out: _Columns) -
     """A quantity whose column, and unit behind a colon, is stated."""
     table, (name, _, unit) = recogniser.table, text.rpartition(":") if ":" in text else (text, "", "")
     if name not in table.names:
-        out.refuse(short, f"{short}: no column '{name}'{nearest_name(name, table.names)}", "column-missing")
+        out.leave_open(short, f"{short}: no column '{name}'{nearest_name(name, table.names)}", "column-missing")
         return
     k = table.names.index(name)
     kind = "time" if short == "t" else _kind_of(short)
     units = [unit] if unit else recogniser.named[k].units(kind) or (["1"] if kind == "fraction" else [])
     known = read_unit(units[0]) if units else None
     if known is None or known.kind != kind:
-        out.refuse(short, f"column '{name}' ({short}): state its unit of {kind}, as '{name}:UNIT'", "unit-unknown")
+        out.leave_open(short, f"column '{name}' ({short}): state its unit of {kind}, as '{name}:UNIT'", "unit-unknown")
         return
     out.values[short] = to_si(table.numbers(k), units[0])
     recogniser.free.discard(k)
@@ -245,7 +247,7 @@ def _read_triad(recogniser: Recogniser, source: SourceProposal, out: _Columns) -
     for short, proposal in zip(shorts, source.columns, strict=True):
         if not proposal.unit:
             words = f"its unit is open ({proposal.why}); state it, as columns={{'{short}': '{proposal.column}:UNIT'}}"
-            out.refuse(short, f"column '{proposal.column}' ({short}): {words}", "unit-unknown")
+            out.leave_open(short, f"column '{proposal.column}' ({short}): {words}", "unit-unknown")
             continue
         values = recogniser.table.numbers(recogniser.table.names.index(proposal.column))
         out.values.setdefault(short, to_si(values, proposal.unit))
@@ -265,7 +267,7 @@ def _read_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: _Co
             unit = units[0] if units else "" if named.unknown_unit else column_unit(short, meaning.kind, values)[0]
             if not unit:
                 words = f"its unit of {meaning.kind} is open; state it, as columns={{'{short}': '{named.name}:UNIT'}}"
-                out.refuse(short, f"column '{named.name}' ({short}): {words}", "unit-unknown")
+                out.leave_open(short, f"column '{named.name}' ({short}): {words}", "unit-unknown")
             else:
                 out.values[short] = to_si(values, unit)
             recogniser.free.discard(k)

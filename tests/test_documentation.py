@@ -133,7 +133,7 @@ def test_page_of_codes_has_every_code_that_a_call_states():
     for path in (path for package in message_codes().PACKAGES for path in (ROOT / package).rglob("*.py")):
         words = [word for node in ast.walk(ast.parse(path.read_text())) for word in getattr(node, "keywords", [])]
         stated |= {w.value.value for w in words if w.arg == "code" and isinstance(w.value, ast.Constant)}
-    assert len(stated) > 150
+    assert len(stated) > 60
     assert not stated - set(listed)
 
 
@@ -145,7 +145,7 @@ def test_page_of_codes_has_every_text_that_looks_like_one():
     module = message_codes()
     sources = [path.read_text() for package in module.PACKAGES for path in (ROOT / package).rglob("*.py")]
     written = {word for source in sources for word in A_CODE_OF_WORDS.findall(source)}
-    assert len(written) > 350
+    assert len(written) > 200
     in_examples = {"my-flight"}
     assert written - set(module.message_codes()) == module.NO_CODES | in_examples
 
@@ -158,13 +158,13 @@ def test_page_of_codes_has_every_code_that_tests_expect():
                 expected |= {arg.value for arg in node.args if isinstance(arg, ast.Constant)}
             elif isinstance(node, ast.keyword) and node.arg == "codes" and isinstance(node.value, ast.Set):
                 expected |= {each.value for each in node.value.elts if isinstance(each, ast.Constant)}
-    assert len(expected) > 80
+    assert len(expected) > 40
     assert not expected - set(listed)
 
 
 @pytest.mark.parametrize(
     ("code", "words"),
-    [("value-range", "lies outside IGRF-14"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
+    [("time-far", "or choose a span with use_s"), ("toml-syntax", "not valid TOML"), ("rest-found", "at_rest")],
 )
 def test_page_of_codes_says_what_the_message_says(code: str, words: str):
     assert words in message_codes().message_codes()[code]

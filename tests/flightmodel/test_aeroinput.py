@@ -235,7 +235,7 @@ def test_daveml_comes_in_through_a_vehicles_table_with_a_sidecar():
         ('name="normalForceCoefficient" varID="CN"', 'name="yaw" varID="Cn"', "daveml-unsupported", "CN"),
         ("1.5, 3.0, 6.0", "1.5, 1.5, 6.0", "file-unreadable", ""),
         ("0.2 -0.2 -0.3", "0.2 -0.2", "file-unreadable", "2 values"),
-        ("0.2 -0.2 -0.3", "0.2 x -0.3", "daveml-breakpoints daveml-numbers", ""),
+        ("0.2 -0.2 -0.3", "0.2 x -0.3", "file-unreadable file-unreadable", ""),
         ("<griddedTableRef gtID=", "<ungriddedTableRef utID=", "daveml-unsupported", ""),
         ('<dependentVarRef varID="CA"/>', '<dependentVarRef varID="CX"/>', "daveml-unsupported", "CA"),
         ("0 30 60 90 180", "0 30 60 90 170", "aero-grid", "180|170"),

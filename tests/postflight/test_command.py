@@ -352,7 +352,7 @@ def inherited_sigint(request):
 def test_a_misspelt_command_option_or_choice_names_what_may_be_meant(command, arguments, meant) -> None:
     done = command(*arguments)
     assert done.returncode == 2
-    assert re.search(f"(?i)did you mean .?{meant}", done.stderr), done.stderr
+    assert re.search(f"(?i)did you mean (one of: )?.?{meant}", done.stderr), done.stderr
 
 
 @pytest.mark.usefixtures("inherited_sigint")

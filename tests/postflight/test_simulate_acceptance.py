@@ -217,14 +217,14 @@ GRID = ["mach,alpha_deg,ca,cn,cm,cmq"] + [
     f"{mach},{angle},{1.5 * np.cos(np.radians(angle)):.5f},0.0,0.0,-0.1" for mach in (0, 3, 9) for angle in (0, 90, 180)
 ]
 SIDECAR = 'source = "x"\nlicence = "x"\narea_m2 = 3.1416\nlength_m = 2.0\nmoment_reference_station_m = 0.0\n'
-OOPS = "daveml-numbers daveml-breakpoints"
+OOPS = "file-unreadable"
 DAVEML = (Path(__file__).parents[1] / "data" / "blunt_cone.dml").read_text()
 
 
 @pytest.mark.parametrize(
     ("name", "rows", "sidecar", "codes", "names"),
     [
-        ("mine.csv", None, None, "file-missing sidecar-missing", ("mine.csv", "mine.toml")),
+        ("mine.csv", None, None, "file-missing", ("mine.csv", "mine.toml")),
         ("mine.csv", GRID, SIDECAR.replace("area_m2", "area"), "key-unknown key-missing", ("'area_m2'",)),
         ("mine.csv", [*GRID[:4], *GRID[5:]], SIDECAR, "aero-grid", ("mine.csv", "8 rows", "3 Mach", "3 angles")),
         ("mine.csv", GRID[:4], SIDECAR, "aero-grid", ("mine.csv", "Mach")),

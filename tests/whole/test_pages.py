@@ -43,7 +43,6 @@ SMALLER = {
     "--flights 4000": "--flights 32",
     "study --flights 1000": "study --flights 16",
     "demo-flight --flights 1000": "demo-flight --flights 50",
-    "--base 128 --by factor": "--base 8 --by section",
     "--nworkers 16": "--nworkers 1",
 }
 # commands of `make long`, on a whole flight; with a page's name where others run the same in `make test`

@@ -152,7 +152,7 @@ def test_noise_has_no_information_on_a_scale(problem):
     normal = noisy.normal_equations(u, noisy.linearize(u))
     for number in (3, 4, 5, 12, 13, 14):  # scale of gyros; errors of the accelerometer that the trajectory left
         k = problem.first_instrument + number
-        assert abs(normal.right[k]) < 4.0 * 30.0 * np.sqrt(normal.matrix.diagonal[k])
+        assert abs(normal.right[k]) < 4.0 * 30.0 * np.sqrt(normal.matrix.diagonal[normal.place[k]])
 
 
 def flown_spans(measured, truth, vehicle):
