@@ -31,8 +31,8 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 CODE = re.compile(r"\[([a-z0-9]+(?:-[a-z0-9]+)+)\]")
 # the command with all digits in its tables
 WHOLE = """import sys
-from postflight.streams import leave_arrow_out, pin_threads
-pin_threads(); leave_arrow_out()
+from postflight.streams import pin_threads
+pin_threads()
 from postflight import run_folder
 assert run_folder.DIGITS == "%.10g"
 run_folder.DIGITS = "%.17g"
