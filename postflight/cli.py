@@ -7,6 +7,8 @@ The commands ``postflight montecarlo`` and ``postflight study``: many flights at
 from __future__ import annotations
 
 import _thread
+import atexit
+import gc
 import os
 import signal
 import sys
@@ -23,7 +25,10 @@ import click
 
 from postflight.streams import close_streams, open_streams, pin_threads, write_out
 
-# heavy imports stand inside the commands, so that --help answers at once
+# heavy imports stand inside the commands, so that --help answers at once; they make hundred thousands of objects, in
+# which five hundred searches for garbage, and one at the end, find none: a sixth of a command's time
+gc.set_threshold(50_000, 20, 100)
+atexit.register(gc.freeze)
 FOLDER = click.Path(path_type=Path)
 
 
