@@ -67,8 +67,8 @@ _OWN = {
     "ax": "ax_cg_mps2", "ay": "ay_cg_mps2", "az": "az_cg_mps2",
     "p": "p_body_degps", "q": "q_body_degps", "r": "r_body_degps", "wind_sd": "wind_sd_mps",
 }  # fmt: skip
-_TRIADS = {"sensors.accelerometer": "acceleration", "sensors.rates": "rate"}
 _FORCE, _RATES = ("ax", "ay", "az"), ("p", "q", "r")
+_TRIADS = {"sensors.accelerometer": _FORCE, "sensors.rates": _RATES}
 # a day's temperature departs from the standard by a fifth at the most, in the mesosphere; the root of that
 _SOUND_OFF = 0.12
 _DENSITY_FACTOR, _STANDARD_HOLDS_M = 2.0, 80e3  # far beyond what a day's density departs from the standard's below
@@ -241,7 +241,7 @@ def _kind_of(short: str) -> str:
 
 def _read_triad(recogniser: Recogniser, source: SourceProposal, out: _Columns) -> None:
     """Three axes of accelerometer or gyros, as the importer recognises them."""
-    shorts = _FORCE if source.section == "sensors.accelerometer" else _RATES
+    shorts = _TRIADS[source.section]
     if out.has(*shorts):
         return
     for short, proposal in zip(shorts, source.columns, strict=True):

@@ -78,6 +78,7 @@ def test_without_frames_of_little_load_the_benchmark_s_own_load_counts():
     pulse = np.flatnonzero(LOAD / LOAD.max() > 0.2)
     follows = (D(4.0) * LOAD / LOAD.max())[:, None] * np.array([0.6, -0.8])
     found = read(follows, at=pulse[0], rows=pulse)
+    assert "frames with little load (" not in found.remark
     assert not found.passed
     assert found.value * PRIOR_RAD == pytest.approx(np.linalg.norm(follows[pulse[0]]), rel=1e-9)
     assert read(follows, at=pulse[0], rows=pulse, corrected=True) is None
