@@ -49,12 +49,12 @@ def _simulator() -> None:
 
 
 def _fly_ensemble(creep: int) -> None:
-    from synthetic_flight.ensemble import Start, fly_ensemble
+    from synthetic_flight.ensemble import Start, fly_legs
     from synthetic_flight.simulate import Schedule, parameter_vector, vacuum_table
 
     vehicle, state = _vehicle_at_rest()
     start = Start(np.append(state, np.zeros(creep)), parameter_vector(vehicle), vacuum_table())
-    list(fly_ensemble(vehicle, lambda _run: start, [0], Schedule(0.001, 1, 2)))
+    fly_legs(vehicle, [0], [start], [Schedule(0.001, 1, 2)])
 
 
 def _ensembles() -> None:

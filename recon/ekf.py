@@ -363,15 +363,17 @@ def empty_pass(problem: Problem) -> tuple[Steps, Filtered, Innovations]:
     count = len(problem.row)
     kept: IntArray = np.full(n, -1, dtype=np.int64)
     kept[problem.kept] = np.arange(int(problem.kept.sum()))
-    steps = Steps(np.empty((n - 1, 9, dense)), np.empty((n - 1, 9, 9)), np.empty((n - 1, m)), np.empty((n - 1, m)))
-    run = Filtered(
-        np.empty((n, size)),
-        np.empty((n, size)),
-        np.empty((n, size * (size + 1) // 2)),
-        kept,
-        np.empty((int(problem.kept.sum()), dense * (dense + 1) // 2)),
-        np.empty((size, size)),
-    )
+    # one piece for what a pass needs alone, so that it goes back to the system whole
+    triangles = size * (size + 1) // 2, dense * (dense + 1) // 2
+    shapes = (
+        (n - 1, 9, dense), (n - 1, 9, 9), (n - 1, m), (n - 1, m), (n, size), (n, size), (n, triangles[0]),
+        (int(problem.kept.sum()), triangles[1]), (size, size),
+    )  # fmt: skip
+    sizes = [math.prod(shape) for shape in shapes]
+    pieces = np.split(np.empty(sum(sizes)), np.cumsum(sizes[:-1]))
+    parts = [piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)]
+    x_minus, x_plus, p_minus, p_plus, p_last = parts[4:]
+    steps, run = Steps(*parts[:4]), Filtered(x_minus, x_plus, p_minus, kept, p_plus, p_last)
     innovations = Innovations(
         np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.zeros(count, dtype=bool),
         np.zeros((count, size, 3)), np.zeros((count, 3, 9)), np.zeros((count, 3, SLOTS)),

@@ -94,7 +94,7 @@ def fly_ensemble(
     runs : iterable of int
     schedule : Schedule
     workers : int, optional
-        Threads; every core by default. No more than two blocks a worker are in memory at a time.
+        Threads; every core by default. A block for each is in memory at a time, two for one.
 
     Yields
     ------
@@ -113,7 +113,7 @@ def fly_ensemble(
     with ThreadPoolExecutor(workers) as pool:
         waiting: deque[tuple[list[int], Future[list[Flown]]]] = deque()
         while True:
-            while len(waiting) < workers + 1 and (block := list(islice(remaining, LANES))):
+            while len(waiting) < max(workers, 2) and (block := list(islice(remaining, LANES))):
                 starts = [start_of(run) for run in block]
                 waiting.append((block, pool.submit(_fly_block, vehicle, block, starts, schedule)))
             if not waiting:

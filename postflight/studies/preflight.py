@@ -191,7 +191,7 @@ class _Entry:
         velocity, omega = self.at_start.velocity_ecef_mps[0], self.at_start.omega_body_eci_body_radps[0]
         state = state_from_ecef(self.start_s, position, velocity, q, omega)
         parameters = simulate.parameter_vector(vehicle, *scales)
-        return Start(state, parameters, simulate.atmosphere_table(profile)[:AIR_ROWS]), vehicle
+        return Start(state, parameters, simulate.atmosphere_table(profile)[:AIR_ROWS].copy()), vehicle
 
     def fly(self, runs: list[tuple[int, int] | None]) -> Iterator[tuple[FloatArray, FloatArray, bool]]:
         """Centerbody's total angle of attack, deg, normal acceleration, g, and whether it ended early, of each run."""
