@@ -51,7 +51,7 @@ class Quantity(NamedTuple):
     truth: float
     error: float
     sd: float
-    missing: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -90,16 +90,18 @@ class Limits:
 
     def failures(self, of: Quantity) -> list[Issue]:
         """Limits that a quantity exceeds."""
-        name, unit, _, error, sd, missing = of
-        kind, limit = "deflection" if name in METHODS else "trajectory", getattr(self, unit)
+        name, unit, _, error, sd, reason = of
+        missing = "deflection-missing" if name in METHODS else "trajectory-missing"
+        too_large = "deflection-error" if name in METHODS else "trajectory-error"
+        limit = getattr(self, unit)
         if not np.isfinite(error) or not np.isfinite(sd):
-            words = f"{name}: no answer ({missing}); name it with --without if none is expected"
-            return [] if name in self.without else [Issue(words, f"{kind}-missing", name)]
+            words = f"{name}: no answer ({reason}); name it with --without if none is expected"
+            return [] if name in self.without else [Issue(words, missing, name)]
         words, out = f"{name}: error {error:+.3g} {unit} beyond", list[Issue]()
         if not abs(error) <= self.sd * sd:
-            out.append(Issue(f"{words} {self.sd:g} sd of {sd:.3g} {unit}", f"{kind}-error", name))
+            out.append(Issue(f"{words} {self.sd:g} sd of {sd:.3g} {unit}", too_large, name))
         elif limit is not None and not abs(error) <= limit:
-            out.append(Issue(f"{words} {limit:g} {unit}", f"{kind}-error", name))
+            out.append(Issue(f"{words} {limit:g} {unit}", too_large, name))
         if limit is not None and not sd <= limit:
             words = f"{name}: sd {sd:.3g} {unit} above the limit of {limit:g} {unit}, which it cannot show to be kept"
             out.append(Issue(words, "sd-above-limit", name))

@@ -145,9 +145,8 @@ def check_vehicle(vehicle: Vehicle, pressure_pa: float = 0.0, mach: float | None
     states = mass_states(vehicle)
     found = {name: numbers_of(state, slopes, pressure_pa) for name, state in states.items()}
     table = pd.DataFrame(found).rename_axis(["quantity", "unit"]).reset_index()
-    critical = [Issue(words, "pressure-above-critical", vehicle.name) for words in _too_soft(found, pressure_pa)]
-    issues = [*vehicle_issues(vehicle), *critical]
-    return VehicleCheck(vehicle, at, pressure_pa, table, tuple(issues))
+    issues = (*vehicle_issues(vehicle), *_too_soft(found, pressure_pa))
+    return VehicleCheck(vehicle, at, pressure_pa, table, issues)
 
 
 def mass_states(vehicle: Vehicle) -> dict[str, Vehicle]:
@@ -247,14 +246,17 @@ def _unstable(vehicle: Vehicle) -> list[Issue]:
     return [Issue(words, "statically-unstable", "aerodynamics")]
 
 
-def _too_soft(found: dict[str, dict[tuple[str, str], float]], pressure_pa: float) -> list[str]:
-    """Say where the stated pressure is above that at which the joint diverges."""
+def _too_soft(found: dict[str, dict[tuple[str, str], float]], pressure_pa: float) -> list[Issue]:
+    """Critical dynamic pressures below the stated one."""
+    critical = {state: numbers["critical dynamic pressure", "Pa"] for state, numbers in found.items()}
     return [
-        f"the joint diverges at {numbers['critical dynamic pressure', 'Pa']:.0f} Pa ({state}), below the stated "
-        f"{pressure_pa:.0f} Pa: check joint.bending_stiffness_nmprad and the pressure"
-        for state, numbers in found.items()
-        if pressure_pa and numbers["critical dynamic pressure", "Pa"] <= pressure_pa
-    ]
+        Issue(
+            f"the joint diverges at {limit:.0f} Pa ({state}), below the stated {pressure_pa:.0f} Pa: check "
+            "joint.bending_stiffness_nmprad and the pressure", "pressure-above-critical", "joint",
+        )
+        for state, limit in critical.items()
+        if pressure_pa and limit <= pressure_pa
+    ]  # fmt: skip
 
 
 # the command
