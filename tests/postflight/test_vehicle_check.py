@@ -58,10 +58,15 @@ def test_vehicles_that_are_right_have_no_issue(name):
 
 
 def test_the_reference_vehicle_is_the_papers():
-    """Table 3.1's 2.5 Hz, and the mean deflection at peak pressure without spin, which dynamics move by up to 5 %."""
-    found = pf.check_vehicle(pf.read_vehicle("irve2_reference"), pressure_pa=1180.0, mach=5.0)
+    """Table 3.1's 2.5 Hz; means of angle of attack and deflection over 3 s about peak pressure, without spin.
+
+    A tenth is left for what the static model has not: dynamics, and a pressure that is below its peak on average, which
+    the load ratio of 0.8 amplifies five times.
+    """
+    found = pf.check_vehicle(pf.read_vehicle("irve2_reference"), pressure_pa=1180.0, mach=3.1)
     assert value(found, "free-free") == pytest.approx(2.5, rel=1e-3)
-    assert value(found, "deflection") == pytest.approx(3.70, rel=0.05)
+    assert value(found, "deflection") == pytest.approx(3.70, rel=0.1)
+    assert value(found, "trim") == pytest.approx(5.0, rel=0.1)
     assert value(found, "mass") == 155.0
 
 
