@@ -16,6 +16,7 @@ from postflight import commands
 from postflight.checks.folder_check import check_folder
 from postflight.checks.vehicle_check import mass_states
 from postflight.plots import figure_vehicle
+from tests.flightmodel.meshes_of_vehicles import as_drawn, shell_mesh
 from tests.in_process import runner
 from tests.refusing import printed_codes
 
@@ -137,6 +138,20 @@ def test_the_drawing_has_every_mark_where_the_file_has_it():
         np.testing.assert_allclose(marks[name], place, atol=1e-3, err_msg=name)
     np.testing.assert_allclose(marks["camera and line of sight"][:2], [-lens[0], -lens[1]], atol=1e-12)
     assert len(axes.patches) == 2 * vehicle.geometry.torus_count + 1
+
+
+def test_a_body_with_a_mesh_is_drawn_by_it(tmp_path):
+    path = tmp_path / "v.toml"
+    as_drawn(shell_mesh(pf.read_vehicle(OWN).geometry, 24)).export(tmp_path / "shell.stl")
+    table = '\n[meshes.aeroshell]\nfile = "shell.stl"\nunit_m = 0.001\nforward = "z"\nnose = [12.0, -7.0, 55.0]\n'
+    path.write_text(OWN.read_text() + table)
+    vehicle = pf.read_vehicle(path)
+    assert pf.check_vehicle(vehicle).issues == ()
+    (axes,) = figure_vehicle(vehicle).axes
+    (drawn,) = axes.collections
+    corners = np.concatenate([triangle.vertices for triangle in drawn.get_paths()])
+    np.testing.assert_allclose(np.abs(corners[:, 1]).max(), vehicle.geometry.base_radius_m, rtol=0.01)
+    assert len(axes.patches) == 1  # the centerbody, which has none
 
 
 def test_a_notebook_shows_drawing_numbers_and_issues(tmp_path):
