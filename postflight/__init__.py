@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from flightmodel.checks import GateError
     from flightmodel.deflection import DeflectionHistory
     from flightmodel.trajectory import Trajectory
-    from flightmodel.vehicle import read_vehicle
     from postflight import plots
+    from postflight.checks.vehicle_check import check_vehicle, read_vehicle
     from postflight.deflections import (
         Deflections,
         aero_increments,
@@ -72,7 +72,7 @@ _DOOR = {
         "fuse",
         "postflight.flown_coefficients": "AeroIncrements",
         "flightmodel.deflection": "DeflectionHistory",
-        "flightmodel.vehicle": "read_vehicle",
+        "postflight.checks.vehicle_check": "check_vehicle read_vehicle",
         "synthetic_flight.scenarios": "read_scenario",
         "postflight.reconciliation.command": "reconcile",
     }.items()
@@ -92,6 +92,7 @@ __all__ = [
     "aero_increments",
     "air_data",
     "check_flight",
+    "check_vehicle",
     "compare",
     "estimate_camera",
     "estimate_misalignment",

@@ -1,5 +1,5 @@
 """The ``postflight`` command. Exit codes: 0 fine, 2 usage or configuration, 3 data refused, 4 an estimator gave no
-answer, 5 a synthetic-truth check failed, 130 interrupted, 143 terminated.
+answer, 5 the truth was not recovered or, with ``--strict``, a check is red, 130 interrupted, 143 terminated.
 
 The commands ``postflight montecarlo`` and ``postflight study``: many flights at once.
 """
@@ -241,6 +241,12 @@ def what_ifs(command: Callable[..., None]) -> Callable[..., None]:
     return taking
 
 
+def strict_option(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the option that lets a check decide the exit code."""
+    words = "Exit with code 5 if a check is red; everything is written and printed first."
+    return click.option("--strict", is_flag=True, help=words)(command)
+
+
 def of_run(command: Callable[..., None]) -> Callable[..., None]:
     """Add the option that selects a run."""
     words = (
@@ -362,15 +368,16 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--timings", is_flag=True, help="Print how long each stage took.")
+@strict_option
 @what_ifs
 @click.pass_obj
-def run(begun: float, folder: Path, timings: bool, changed: WhatIfs) -> None:
+def run(begun: float, folder: Path, timings: bool, strict: bool, changed: WhatIfs) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
     from postflight.deflections import METHODS
 
     stages = commands.Stages(begun)
-    commands.run(folder, METHODS, commands.asked(*changed), stages=stages)
+    commands.run(folder, METHODS, commands.asked(*changed), stages=stages, strict=strict)
     if timings:
         commands.print_stages(stages)
 
@@ -401,12 +408,21 @@ def reconcile(folder: Path, hardening: bool, freeplay: bool, creep: bool, poster
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.option("--limit-sd", "sd", type=FiniteRange(0.0), default=4.0, show_default=True, help="Of errors, in own sd.")
+@click.option("--limit-deg", "deg", type=FiniteRange(0.0), help="Of errors and sd of deflections and angle of attack.")
+@click.option("--limit-m", "m", type=FiniteRange(0.0), help="Of error and sd of the position.")
+@click.option("--limit-mps", "mps", type=FiniteRange(0.0), help="Of error and sd of the velocity.")
+@click.option("--without", multiple=True, metavar="NAME", help="A method that need not answer; repeat for several.")
 @of_run
-def score(folder: Path, as_json: bool, wanted: str | None) -> None:
-    """Compare a run of a synthetic flight, the last complete one, with its truth; exit 5 where recovery fails."""
-    from postflight import commands
+def score(folder: Path, as_json: bool, wanted: str | None, **limits: Any) -> None:
+    """Compare a run of a synthetic flight, the last complete one, with its truth; exit 5 where recovery fails.
 
-    commands.score(folder, as_json, wanted)
+    A limit in a unit holds for the error and for the standard deviation: a run does not pass by knowing nothing.
+    """
+    from postflight import commands
+    from postflight.scoring import Limits
+
+    commands.score(folder, as_json, wanted, Limits(**limits))
 
 
 @cli.command()
@@ -447,13 +463,26 @@ def compare(runs: tuple[str, ...], output: Path | None) -> None:
 
 
 @cli.command()
-@click.argument("folder", type=FOLDER)
+@click.argument("folder", type=FOLDER, metavar="FOLDER|VEHICLE")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-def check(folder: Path, as_json: bool) -> None:
-    """Look at the data of the flight in FOLDER: rates, gaps, stuck and doubtful sensors, units, axes, clocks."""
-    from postflight.checks import folder_check
+@strict_option
+@click.option("--pressure", type=FiniteRange(0.0), help="Of VEHICLE: dynamic pressure at which it trims, Pa.")
+@click.option("--mach", type=FiniteRange(0.0), help="Of VEHICLE: Mach number; default: the largest of its table.")
+@click.option("--drawing", type=click.Path(dir_okay=False, path_type=Path), help="PNG of VEHICLE; default: NAME.png.")
+def check(folder: Path, as_json: bool, strict: bool, **of_vehicle: Any) -> None:
+    """Look at the data of the flight in FOLDER: rates, gaps, stuck and doubtful sensors, units, axes, clocks.
 
-    folder_check.check(folder, as_json)
+    VEHICLE is a vehicle file (.toml) or the name of a shipped one: it is drawn from the side, with its mass properties,
+    static margin, frequency, critical dynamic pressure and trim.
+    """
+    from postflight.checks import folder_check, vehicle_check
+
+    if vehicle_check.is_vehicle(folder):
+        vehicle_check.check(folder, as_json, strict, **of_vehicle)
+        return
+    if any(value is not None for value in of_vehicle.values()):
+        raise click.UsageError("--pressure, --mach and --drawing belong to a vehicle file")
+    folder_check.check(folder, as_json, strict)
 
 
 @cli.command()

@@ -29,11 +29,11 @@ from postflight.flight import NO_VIDEO, Flight, read_flight
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
-from postflight.scoring import PUBLISHED_DEG, Score, score_run
+from postflight.scoring import PUBLISHED_DEG, Limits, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
 from postflight.streams import write_out
 from postflight.studies.preflight import Bounds, entry_bounds
-from postflight.terminal import few_of_each, progress_bar, terminal
+from postflight.terminal import EXIT_CHECK_FAILED, EXIT_NO_ANSWER, few_of_each, progress_bar, terminal
 from synthetic_flight.folder import Event, check_destination, flight_events, simulate_to_folder
 from synthetic_flight.scenarios import read_scenario, shipped_scenarios
 from synthetic_flight.simulate import Truth
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from estimators.fusing import CameraTimeBias
     from postflight.filming import CameraAnswer
 
-EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5
 SHORT = {
     "position": "pos.", "velocity": "vel.", "attitude": "att.", "total angle of attack": "alpha",
     "dynamic pressure": "q", "density of the day": "rho", "C_A": "C_A",
@@ -164,11 +163,13 @@ def print_stages(stages: Stages) -> None:
 
 
 def run(
-    folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False, stages: Stages | None = None
-) -> None:
+    folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False, stages: Stages | None = None,
+    strict: bool = False,
+) -> None:  # fmt: skip
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
 
-    The answers are printed before tables, figures and report are written.
+    The answers are printed before tables, figures and report are written. With ``strict`` a failed consistency check
+    makes the exit code 5, after everything is written.
     """
 
     def show_answers(bet: Reconstruction, answers: Deflections, events: pd.DataFrame) -> None:
@@ -183,6 +184,9 @@ def run(
     console.print(f"results in {escape(str(written))}, to read in report.html")
     if any(reason.code != NO_VIDEO for reason in answers.refused.values()):
         sys.exit(EXIT_NO_ANSWER)
+    if strict and answers.doubt:
+        console.coded("[red]failed[/]", f"--strict: {answers.doubt}", "answers-in-doubt")
+        sys.exit(EXIT_CHECK_FAILED)
 
 
 class _Figures:
@@ -570,9 +574,9 @@ def calibrate(corners: Path, size: str, lens: Lens) -> None:
     console.print(escape(found.toml()), highlight=False)
 
 
-def score(folder: Path, as_json: bool, wanted: str | None = None) -> None:
+def score(folder: Path, as_json: bool, wanted: str | None = None, limits: Limits | None = None) -> None:
     """Score a run (`find_run`); exit 5 where recovery fails."""
-    result = score_run(folder, None if wanted is None else find_run(folder, wanted))
+    result = score_run(folder, None if wanted is None else find_run(folder, wanted), limits)
     if as_json:
         write_out(json.dumps(result.as_json()) + "\n")
     else:

@@ -5,19 +5,24 @@ root-mean-square errors ``sqrt(mean |estimate - truth|^2)`` over those rows of t
 gap of the gyros has no rates, and a flight without inertial sensors no attitude. An error is too large beyond four
 of the run's own standard deviations (of the trajectory their root-mean-square over the pulse), so that a limit fits any
 vehicle, flight and instrument. How small the standard deviations are is printed beside them.
+
+A run that knows nothing has large standard deviations, and would keep such a limit with any error. A limit in a
+quantity's own unit (`Limits`) therefore bounds the standard deviation as well as the error: an answer that is less
+certain than the limit cannot show that the limit is kept. What has no answer fails unless it is named.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import FloatArray, GateError, Issue
+from flightmodel.checks import ConfigError, FloatArray, GateError, Issue, nearest_name
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
@@ -33,13 +38,79 @@ BET_SD = {
     "velocity_rms_mps": tuple(f"v{a}_ecef_sd_mps" for a in "xyz"),
     "alpha_total_rms_deg": ("alpha_total_wind_sd_deg",),
 }
+SCORED = (*METHODS, *(name.partition("_rms_")[0] for name in BET_SD))
 # deflections at peak that were published of a shipped vehicle's flight: AIAA 2011-2571, figures 2.3, 2.7 and 2.9
 PUBLISHED_DEG = {"irve2_reference": ("IRVE-II (paper)", {"camera": 4.2, "misalignment": 3.5, "trim": 3.75})}
 
 
+class Quantity(NamedTuple):
+    """What is scored: its name in `SCORED`, its values in its unit (NaN for none), why it has no answer."""
+
+    name: str
+    unit: str
+    truth: float
+    error: float
+    sd: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How large errors and standard deviations may be where the truth is recovered.
+
+    Parameters
+    ----------
+    sd : float
+        Of an error, in the quantity's own standard deviations.
+    deg, m, mps : float or None
+        Of error and standard deviation of every quantity in that unit; None for no limit.
+    without : tuple of str
+        Quantities of `SCORED` that may be without an answer.
+
+    Raises
+    ------
+    ConfigError
+        ``name-unknown``: ``without`` names what is not scored.
+    """
+
+    sd: float = LIMIT_SD
+    deg: float | None = None
+    m: float | None = None
+    mps: float | None = None
+    without: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        faults = [
+            f"without '{name}': no such quantity{nearest_name(name, SCORED)}; scored are {', '.join(SCORED)}"
+            for name in self.without
+            if name not in SCORED
+        ]
+        if faults:
+            raise ConfigError(faults, "name-unknown")
+
+    def failures(self, of: Quantity) -> list[Issue]:
+        """Limits that a quantity exceeds."""
+        name, unit, _, error, sd, reason = of
+        missing = "deflection-missing" if name in METHODS else "trajectory-missing"
+        too_large = "deflection-error" if name in METHODS else "trajectory-error"
+        limit = getattr(self, unit)
+        if not np.isfinite(error) or not np.isfinite(sd):
+            words = f"{name}: no answer ({reason}); name it with --without if none is expected"
+            return [] if name in self.without else [Issue(words, missing, name)]
+        words, out = f"{name}: error {error:+.3g} {unit} beyond", list[Issue]()
+        if not abs(error) <= self.sd * sd:
+            out.append(Issue(f"{words} {self.sd:g} sd of {sd:.3g} {unit}", too_large, name))
+        elif limit is not None and not abs(error) <= limit:
+            out.append(Issue(f"{words} {limit:g} {unit}", too_large, name))
+        if limit is not None and not sd <= limit:
+            words = f"{name}: sd {sd:.3g} {unit} above the limit of {limit:g} {unit}, which it cannot show to be kept"
+            out.append(Issue(words, "sd-above-limit", name))
+        return out
+
+
 @dataclass(frozen=True, repr=False)
 class Score(Tabular):
-    """A run against its truth: ``methods`` and ``bet`` as printed by ``score --json``, and what failed.
+    """A run against its truth: ``methods`` and ``bet`` as printed by ``score --json``, judged by ``limits``.
 
     ``vehicle`` is the name of the stated one.
     """
@@ -47,30 +118,94 @@ class Score(Tabular):
     peak_s: float
     methods: dict[str, dict[str, Any]]
     bet: dict[str, float]
-    failures: tuple[Issue, ...]
+    limits: Limits
     vehicle: str = ""
 
     def to_frame(self) -> pd.DataFrame:
         """One row a method at the true peak: ``method, deflection_deg, sd_deg, truth_deg, error_deg, ...``."""
         return pd.DataFrame([{"method": name, **row} for name, row in self.methods.items()])
 
+    @property
+    def scored(self) -> list[Quantity]:
+        """Every quantity of `SCORED`; of the trajectory rms errors over the pulse, which have no one truth."""
+        out = []
+        for name, row in self.methods.items():
+            error, sd = (np.nan if row[key] is None else row[key] for key in ("error_deg", "sd_deg"))
+            out.append(Quantity(name, "deg", row["truth_deg"], error, sd, row.get("reason", "")))
+        for key in BET_SD:
+            name, _, unit = key.partition("_rms_")
+            out.append(Quantity(name, unit, np.nan, self.bet[key], self.bet[_sd(key)], "none was estimated"))
+        return out
+
+    def quantities(self) -> pd.DataFrame:
+        """Return what is judged: ``quantity, unit, truth, error, sd, limit_sd, limit, passed``, one row each.
+
+        ``truth``, ``error``, ``sd`` and ``limit`` are in ``unit``, ``limit_sd`` in standard deviations.
+        """
+        rows = [
+            (*of[:5], self.limits.sd, getattr(self.limits, of.unit), not self.limits.failures(of)) for of in self.scored
+        ]
+        columns = ["quantity", "unit", "truth", "error", "sd", "limit_sd", "limit", "passed"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @property
+    def failures(self) -> tuple[Issue, ...]:
+        """Limits that are exceeded."""
+        return tuple(issue for of in self.scored for issue in self.limits.failures(of))
+
     def _about(self) -> str:
         found = f"{len(self.failures)} limits exceeded" if self.failures else "truth recovered within every limit"
         return f"at the true peak, {self.peak_s:.3f} s: {found}"
 
+    def assert_recovered(
+        self,
+        limit_sd: float = LIMIT_SD,
+        limit_deg: float | None = None,
+        limit_m: float | None = None,
+        limit_mps: float | None = None,
+        without: Iterable[str] = (),
+    ) -> None:
+        """Raise where the truth is not recovered within these limits.
+
+        Parameters
+        ----------
+        limit_sd : float
+            Largest error in the quantity's own standard deviations.
+        limit_deg, limit_m, limit_mps : float, optional
+            Largest error, and largest standard deviation, of quantities in deg (the deflections and the total angle of
+            attack), m (position) and m/s (velocity).
+        without : iterable of str
+            Quantities that need no answer: methods, or ``position``, ``velocity``, ``alpha_total``.
+
+        Raises
+        ------
+        AssertionError
+            With a table of every quantity and one line a failure.
+        ConfigError
+            ``name-unknown``: ``without`` names what is not scored.
+        """
+        judged = replace(self, limits=Limits(limit_sd, limit_deg, limit_m, limit_mps, tuple(without)))
+        if judged.failures:
+            table = judged.quantities().to_string(index=False, na_rep="-", float_format=lambda x: f"{x:.3g}")
+            raise AssertionError("\n".join(["the truth is not recovered", table, *judged.failures]))
+
     def as_json(self) -> dict[str, Any]:
         """Return one object for machines."""
+        table = self.quantities().astype(object)
         return {
             "peak_dynamic_pressure_s": self.peak_s,
             "methods": self.methods,
             "bet": {name: value if np.isfinite(value) else None for name, value in self.bet.items()},
+            "limits": asdict(self.limits),
+            "quantities": table.where(table.notna(), None).to_dict("records"),
             "passed": not self.failures,
             "failures": list(self.failures),
+            "failure_codes": [failure.code for failure in self.failures],
         }
 
 
-def score_run(flight_folder: Path, run: Path | None = None) -> Score:
-    """Score the newest (or the given) run.
+def score_run(flight_folder: Path, run: Path | None = None, limits: Limits | None = None) -> Score:
+    """Score the newest (or the given) run by these limits, or by `LIMIT_SD` alone.
 
     Raises
     ------
@@ -87,26 +222,15 @@ def score_run(flight_folder: Path, run: Path | None = None) -> Score:
     true_deg = float(np.interp(peak_s, deflection["t_s"], deflection["theta_deg"]))
     refused = read_back(run / "summary.json", "methods")["methods"]
     methods: dict[str, dict[str, Any]] = {}
-    failures: list[Issue] = []
     written = {path.stem for path in run.glob("*.csv")}
     for method in METHODS:
-        row = _method_row(run / f"{answer_table(method, written)}.csv", peak_s, true_deg)
-        methods[method] = row
-        if row["deflection_deg"] is None and refused.get(method, {}).get("applicable", True):
-            reason = refused.get(method, {}).get("reason", "not run")
-            failures.append(Issue(f"{method}: no answer at peak ({reason})", "deflection-missing"))
-        elif row["deflection_deg"] is not None and not abs(row["error_deg"]) <= LIMIT_SD * row["sd_deg"]:
-            words = f"{method}: error {row['error_deg']:+.2f} deg beyond {LIMIT_SD:g} sd of {row['sd_deg']:.2f} deg"
-            failures.append(Issue(words, "deflection-error"))
+        methods[method] = _method_row(run / f"{answer_table(method, written)}.csv", peak_s, true_deg)
+        if methods[method]["deflection_deg"] is None:
+            methods[method]["reason"] = refused.get(method, {}).get("reason", "not run")
     stated = tuple(name for names in BET_SD.values() for name in names)
     bet = _bet_errors(_read(run / "bet.csv", (*STATE_COLUMNS, "alpha_total_wind_deg", *stated)), truth)
-    failures += [
-        Issue(f"BET {name}: {bet[name]:.3f} beyond {LIMIT_SD:g} sd of {bet[_sd(name)]:.3f}", "trajectory-error")
-        for name in BET_SD
-        if np.isfinite(bet[_sd(name)]) and not bet[name] <= LIMIT_SD * bet[_sd(name)]
-    ]
     vehicle = read_back(run / "bet_header.json").get("vehicle")
-    return Score(peak_s, methods, bet, tuple(failures), "" if vehicle is None else vehicle["name"])
+    return Score(peak_s, methods, bet, limits or Limits(), "" if vehicle is None else vehicle["name"])
 
 
 def _sd(name: str) -> str:

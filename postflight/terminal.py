@@ -24,6 +24,9 @@ if TYPE_CHECKING:  # a first line waits for no numpy
     from flightmodel.checks import Issue
 
 
+EXIT_NO_ANSWER, EXIT_CHECK_FAILED = 4, 5  # docs/how-to.md has all exit codes
+
+
 class Terminal(Console):
     """A console that prints what files say as `visible` text, and prints on into nothing where nobody reads."""
 

@@ -128,7 +128,7 @@ def modes(matrix: FloatArray) -> Modes:
     return Modes(values, float(fastest.real), frequencies, zone)
 
 
-def _levers(vehicle: Vehicle, slopes: Slopes) -> tuple[float, float]:
+def levers(vehicle: Vehicle, slopes: Slopes) -> tuple[float, float]:
     """Return ``xbar = m_B r_B / m`` and the static margin ``x_m - x_cg``, m (x_m the metacentre)."""
     body = vehicle.centerbody
     xbar = body.mass_kg * float(vehicle.joint_m[0] - body.cg_m[0]) / vehicle.mass_kg
@@ -141,7 +141,7 @@ def critical_stiffness_nmprad(vehicle: Vehicle, slopes: Slopes, pressure_pa: flo
 
     Of a joint that creeps it is that against loads that stay. Increments of coefficients by deflection are not in it.
     """
-    xbar, margin = _levers(vehicle, slopes)
+    xbar, margin = levers(vehicle, slopes)
     return pressure_pa * vehicle.reference.area_m2 * slopes.ca * xbar * (1.0 + xbar / margin)
 
 
@@ -150,7 +150,7 @@ def static_trim(vehicle: Vehicle, slopes: Slopes, pressure_pa: float, offset_m: 
 
     ``offset_m`` is that of the vehicle's c.g. Diverges as the stiffness nears the critical one; with creep, after it.
     """
-    xbar, margin = _levers(vehicle, slopes)
+    xbar, margin = levers(vehicle, slopes)
     softness = critical_stiffness_nmprad(vehicle, slopes, pressure_pa) / vehicle.joint.held_stiffness_nmprad
     alpha = slopes.ca * offset_m / (slopes.cn_alpha * margin) / (1.0 - softness)
     return alpha, offset_m / xbar * softness / (1.0 - softness)

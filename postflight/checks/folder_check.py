@@ -33,9 +33,10 @@ from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.checks import inertial, pressure_and_field, tracks
 from postflight.checks.track_force import best_comparison, bias_of, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
+from postflight.checks.vehicle_check import vehicle_issues
 from postflight.intake.flight_form import placeholders
 from postflight.streams import write_out
-from postflight.terminal import few_of_each, terminal
+from postflight.terminal import EXIT_CHECK_FAILED, few_of_each, terminal
 
 _FORCE_WIDTH_S = 8.0  # the second derivative of a radar track of 5 m at 10 Hz is then good to 0.25 m/s2
 WIDE = 160  # of a log file: a table need not be squeezed there
@@ -257,6 +258,7 @@ def _cross_check(found: Sources, report: Report) -> None:
     remarks += rotation
     # last: gyros and attitude are only compared where nothing else is suspicious
     remarks += benchmark_frame(found)
+    remarks += vehicle_issues(found.vehicle) if found.vehicle is not None else []
     report.findings += text_in_films(found) + frozen_films(found)
 
 
@@ -318,9 +320,14 @@ def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord]
 # the command
 
 
-def check(folder: Path, as_json: bool) -> None:
-    """Print what a flight folder holds, what is suspicious and what is refused; leave with its exit code."""
+def check(folder: Path, as_json: bool, strict: bool = False) -> None:
+    """Print what a flight folder holds, what is suspicious and what is refused; leave with its exit code.
+
+    With ``strict`` a suspicious cross-check makes it 5 where nothing is refused.
+    """
     report = check_folder(folder)
+    if strict and report.cross_checks:
+        report.exit_code = report.exit_code or EXIT_CHECK_FAILED
     if as_json:
         write_out(json.dumps(report.as_json(), indent=2, allow_nan=False) + "\n")
     else:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         figure_residuals,
         figure_sensitivity,
     )
+    from postflight.plots.vehicle import figure_vehicle
 
 # imported on first use: matplotlib takes half a second
 _DOOR = {
@@ -40,6 +41,7 @@ _DOOR = {
     ),
     "reconciliation": ("figure_modes", "figure_posterior", "figure_reconciled"),
     "studies": ("figure_bands", "figure_joints", "figure_preflight", "figure_table_3_1"),
+    "vehicle": ("figure_vehicle",),
     "overlay": ("write_overlay_film",),
     "run_figures": ("draw_camera", "draw_run"),
     "style": ("COLOUR", "ZONE", "in_style", "save", "stamp"),
@@ -51,7 +53,7 @@ __all__ = [
     "figure_air", "figure_attitude", "figure_bands", "figure_correlation", "figure_filter_and_smoother", "figure_flown",
     "figure_fusion", "figure_increments", "figure_joints", "figure_modes", "figure_posterior", "figure_preflight",
     "figure_reconciled", "figure_residuals", "figure_sensitivity", "figure_summary", "figure_table_3_1",
-    "in_style", "save", "stamp", "write_overlay_film",
+    "figure_vehicle", "in_style", "save", "stamp", "write_overlay_film",
 ]  # fmt: skip
 
 

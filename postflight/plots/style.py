@@ -19,7 +19,7 @@ import warnings
 from collections.abc import Callable, Iterable
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+from typing import IO, TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -213,8 +213,8 @@ def titled(figure: Figure, title: str, flown: str | Telemetry | Flight) -> Figur
     return figure
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG whose bytes depend on the picture alone.
+def save(figure: Figure, path: Path | IO[bytes]) -> None:
+    """Write a PNG, to a file or a buffer, whose bytes depend on the picture alone.
 
     As `savefig` does, which draws every figure once more in vain to lay it out.
     """
