@@ -19,9 +19,9 @@ from postflight.plots.style import COLOUR, with_holes
 from postflight.report import pictures
 from postflight.report import text as texts
 from postflight.report.panels import trajectory_panels, trajectory_rows
-from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
+from postflight.report.source import extreme_rows, kept_rows, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
-from postflight.runs import read_tables
+from postflight.runs import read_run, read_tables
 from recon.consistency import doubt
 from tests.postflight.report.conftest import HOSTILE
 
@@ -243,7 +243,10 @@ def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
 def test_an_accelerometer_without_gyros_is_not_called_absent(rocket: Path, run) -> None:
     """A deceleration carries the flight, and no force stands in body axes."""
     without = read_run(rocket)
-    sensed = replace(without, telemetry=replace(without.telemetry, accelerometer=run.telemetry.accelerometer))
+    sensed = replace(
+        without,
+        given=replace(without.flight, telemetry=replace(without.telemetry, accelerometer=run.telemetry.accelerometer)),
+    )
     rows = trajectory_rows(without)
     one, other = (
         {name: why for name, _, why in trajectory_panels(flown, rows)[1] if name in ("axial", "lateral")}
@@ -317,7 +320,7 @@ def test_changed_telemetry_is_refused(rocket: Path, tmp_path: Path) -> None:
     path = tmp_path / "flight" / "flight.toml"
     path.write_text(path.read_text() + "\n# another thought\n")
     with pytest.raises(GateError) as refusal:
-        read_run(tmp_path / "flight")
+        _ = read_run(tmp_path / "flight").flight
     assert refusal.value.codes == ("inputs-changed",)
     assert "flight.toml" in str(refusal.value)
 
