@@ -13,7 +13,7 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, titled
-from postflight.plots.subject import words_of
+from postflight.plots.subject import lacking, words_of
 from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
 from postflight.reconciliation.posterior import (
@@ -47,6 +47,13 @@ class Reconciled(Protocol):
         """Bending stiffness by the joint's frequency."""
 
 
+def _fit_of(figure: str, given: Reconciled) -> JointFit:
+    """Fit of a reconciliation; `GateError` for anything else."""
+    if not isinstance(getattr(given, "fit", None), JointFit):
+        raise lacking(figure, given, "fitted joint", "pf.reconcile(bet)")
+    return given.fit
+
+
 @in_style
 def figure_reconciled(reconciliation: Reconciled, fused: DeflectionHistory | None = None) -> Figure:
     """Rate and lateral force, measured and simulated; deflection; stiffness against offset.
@@ -56,8 +63,14 @@ def figure_reconciled(reconciliation: Reconciled, fused: DeflectionHistory | Non
     reconciliation : Reconciliation
     fused : DeflectionHistory, optional
         To be drawn beside the deflection with the estimated joint.
+
+    Raises
+    ------
+    GateError
+        For anything but a reconciliation.
     """
-    found, history = reconciliation.fit, reconciliation.deflection
+    found = _fit_of("figure_reconciled", reconciliation)
+    history = reconciliation.deflection
     figure = Figure(figsize=(10.0, 9.0))
     axes = figure.subplots(3, 2)
     seen, read = found.problem.measured, found.problem.predict(found.parameters)
@@ -129,7 +142,8 @@ def figure_posterior(reconciliation: Reconciled, posterior: Posterior | None = N
     ConfigError
         Where the sampler (emcee) is not installed.
     """
-    posterior = sample(reconciliation.fit) if posterior is None else posterior
+    fit = _fit_of("figure_posterior", reconciliation)
+    posterior = sample(fit) if posterior is None else posterior
     table = quantities(posterior.fit.problem.vehicle_parameters, posterior.samples)
     best, covariance = linear_quantities(posterior)
     n = len(best)
@@ -177,6 +191,7 @@ def figure_modes(reconciliation: Reconciled, modal: ModalStiffness | None = None
     GateError
         Where the joint's mode is not detected.
     """
+    _fit_of("figure_modes", reconciliation)
     found = reconciliation.modal_stiffness() if modal is None else modal
     figure = Figure(figsize=(9.0, 4.8))
     left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])

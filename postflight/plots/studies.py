@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
+from flightmodel.checks import GateError, check_type
 from flightmodel.vehicle import Vehicle
 from postflight.montecarlo.bands import Merged
 from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, percentiles, titled
@@ -60,6 +61,7 @@ def figure_bands(merged: Merged, words: str = "SYNTHETIC flights") -> Figure:
     GateError
         Where the study kept no histories.
     """
+    check_type("figure_bands", merged, Merged, "pf.monte_carlo(dispersions, folder)")
     bands = merged.bands
     if not len(bands):
         raise lacking("figure_bands", merged, "history", "a study whose [outputs] names histories")
@@ -86,6 +88,7 @@ def figure_table_3_1(vehicle: Vehicle) -> Figure:
     vehicle : Vehicle
         Of `read_vehicle`; its own inertias are drawn beside the paper's.
     """
+    check_type("figure_table_3_1", vehicle, Vehicle, "pf.read_vehicle(file)")
     table = table_3_1(vehicle)
     figure = Figure(figsize=(7.2, 3.6))
     left, right = figure.subplots(1, 2)
@@ -123,7 +126,15 @@ def figure_joints(scenario: Scenario, number: str = "3.1", study: JointStudy | N
         Figure of the paper: ``"3.1"``, ``"3.2"`` or ``"3.3"``.
     study : JointStudy, optional
         The study's flights; they are flown without.
+
+    Raises
+    ------
+    GateError
+        For another figure.
     """
+    check_type("figure_joints", scenario, Scenario, "pf.read_scenario(file)")
+    if number not in _JOINT_FIGURES:
+        raise GateError(f"figure_joints: figure {number}; known are {', '.join(_JOINT_FIGURES)}", "name-unknown")
     name, title, quantity, label = _JOINT_FIGURES[number]
     study = STUDIES[name](scenario, 0) if study is None else study
     figure = Figure(figsize=(7.2, 4.4))
