@@ -320,7 +320,7 @@ class Run(Tabular):
     def findings(self) -> tuple[Issue, ...]:
         """What was found in the data and on the way."""
         rows = self.tables["findings"].astype({"source": str, "what": str}).itertuples()
-        return tuple(Issue(r.what, r.code, r.source, r.start_s, r.end_s) for r in rows)
+        return tuple(Issue(r.what, getattr(r, "code", ""), r.source, r.start_s, r.end_s) for r in rows)
 
     @property
     def residuals(self) -> pd.DataFrame:

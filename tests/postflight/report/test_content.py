@@ -185,7 +185,7 @@ def test_cards_carry_the_result_of_the_tests_of_pairs(run) -> None:
 
 def test_a_pair_that_disagrees_is_named(run) -> None:
     table = run.tables["fusion_agreement"].assign(passed=[True, False, True], chance=[0.5, 1e-4, 0.5])
-    one = type(run)(**{**vars(run), "tables": run.tables | {"fusion_agreement": table}})
+    one = replace(run, tables=run.tables | {"fusion_agreement": table})
     first, second = table["methods"][1].split(" and ")
     cards = {card["method"]: card for card in texts.cards(one)}
     assert cards[first]["state"] == cards[second]["state"] == cards["fused"]["state"] == "differs"
@@ -260,7 +260,7 @@ def test_run_of_the_trajectory_alone(run) -> None:
     bare = {**run.summary, "methods": {}, "agreement": None, "southwell": None}
     tables = {k: v for k, v in run.tables.items() if not k.startswith(("deflection", "fusion", "rigid", "camera"))}
     facts = {**run.facts, "settings": {**run.facts["settings"], "methods": []}}
-    one = type(run)(**{**vars(run), "summary": bare, "tables": tables, "facts": facts})
+    one = replace(run, summary=bare, tables=tables, facts=facts)
     text = page(one)
     assert "°" not in texts.title(one)
     assert {card["reason"] for card in texts.cards(one)} == {texts.NOT_ASKED}
@@ -270,7 +270,7 @@ def test_run_of_the_trajectory_alone(run) -> None:
 def test_failed_checks_and_findings_are_shown(run) -> None:
     bad = {**run.summary, "verdicts_failed": ["NIS north: too large <b>"], "suspects": ["north: its <i> time bias"]}
     found = pd.DataFrame([("north", "gap of 3 s", 430.0, 433.0)] * 300, columns=["source", "what", "start_s", "end_s"])
-    one = type(run)(**{**vars(run), "summary": bad, "tables": run.tables | {"findings": found}})
+    one = replace(run, summary=bad, tables=run.tables | {"findings": found})
     text = page(one)
     assert "✕ NIS north: too large &lt;b&gt;" in text
     assert ": north: its &lt;i&gt; time bias" in text
@@ -281,7 +281,7 @@ def test_failed_checks_and_findings_are_shown(run) -> None:
 def test_failed_checks_are_in_the_title_the_first_sentence_and_on_the_fused_card(run) -> None:
     checks = run.tables["consistency_checks"]
     red = checks.assign(passed=~checks["name"].isin(checks["name"].iloc[:2]))
-    one = type(run)(**{**vars(run), "tables": run.tables | {"consistency_checks": red}})
+    one = replace(run, tables=run.tables | {"consistency_checks": red})
     failed = red.loc[~red["passed"], "name"]
     words = doubt(list(failed), len(red))
     assert all(name.partition(":")[0] in words for name in failed)
