@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -246,7 +246,11 @@ class Run(Tabular):
         them once a second).
         """
         planet = PLANETS[self.header.get("planet", "earth")]
-        return trajectory_of(self.table, self.header["epoch_utc"], planet)
+        parts = ("r{}_ecef_sd_m", "v{}_ecef_sd_mps", "rotation_{}_body_sd_deg")
+        place, velocity, turned = (_columns(self.table, pattern, "xyz") for pattern in parts)
+        sd = np.hstack([place, velocity, np.deg2rad(turned)])
+        covariance = np.where(np.eye(9, dtype=bool), sd[:, :, None] ** 2, np.nan)
+        return replace(trajectory_of(self.table, self.header["epoch_utc"], planet), covariance=covariance)
 
     @property
     def has_attitude(self) -> bool:
@@ -434,12 +438,8 @@ def _columns(table: pd.DataFrame, pattern: str, letters: str) -> FloatArray:
 
 
 def trajectory_of(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z", planet: Planet = WGS84) -> Trajectory:
-    """Trajectory from the `STATE_COLUMNS` that ``truth.csv`` and ``bet.csv`` share, with the latter's variances."""
-    q, covariance = _columns(table, "q{}_ecef_body", "wxyz"), None
-    if "rx_ecef_sd_m" in table:
-        turned = np.deg2rad(_columns(table, "rotation_{}_body_sd_deg", "xyz"))
-        sd = np.hstack([_columns(table, "r{}_ecef_sd_m", "xyz"), _columns(table, "v{}_ecef_sd_mps", "xyz"), turned])
-        covariance = np.where(np.eye(9, dtype=bool), sd[:, :, None] ** 2, np.nan)
+    """Trajectory from the `STATE_COLUMNS` that ``truth.csv`` and ``bet.csv`` share, without a covariance."""
+    q = _columns(table, "q{}_ecef_body", "wxyz")
     return Trajectory(
         epoch_utc,
         table["t_s"].to_numpy(dtype=float),
@@ -448,7 +448,7 @@ def trajectory_of(table: pd.DataFrame, epoch_utc: str = "2000-01-01T00:00:00Z", 
         _columns(table, "v{}_ecef_mps", "xyz"),
         rotations.continuous(q / np.linalg.norm(q, axis=1, keepdims=True)),
         np.deg2rad(_columns(table, "{}_body_degps", "pqr")),
-        covariance,
+        None,
         planet,
     )
 
