@@ -326,11 +326,6 @@ class Run(Tabular):
         rows = self.tables["findings"].astype({"source": str, "what": str}).itertuples()
         return tuple(Issue(r.what, getattr(r, "code", ""), r.source, r.start_s, r.end_s) for r in rows)
 
-    @property
-    def residuals(self) -> pd.DataFrame:
-        """Residuals of every measurement, in the ``unit`` of each row."""
-        return self.tables["residuals"]
-
     def peak(self, name: str) -> pd.Series | None:
         """Row of ``peaks.csv``; None where the flight has none of that name."""
         rows = self.tables["peaks"][self.tables["peaks"]["peak"] == name]

@@ -24,9 +24,8 @@ from postflight.studies.shell_test import ShellTest
 from synthetic_flight.scenarios import Scenario
 
 _ALPHA, _NORMAL = "centerbody total angle of attack (deg)", "centerbody normal acceleration (g)"
-FIGURES_OF_STUDY = {"damping": ("3.1",), "stiffness": ("3.2", "3.3")}
 # figure of the paper: its study, title, quantity and label
-_JOINT_FIGURES = {
+JOINT_FIGURES = {
     "3.1": ("damping", "Damping of the joint at 2.5 Hz, % of critical", "alpha_total_deg", _ALPHA),
     "3.2": ("stiffness", "Stiffness of the joint at 0.5 % of critical", "alpha_total_deg", _ALPHA),
     "3.3": ("stiffness", "Stiffness of the joint at 0.5 % of critical", "normal_g", _NORMAL),
@@ -133,9 +132,9 @@ def figure_joints(scenario: Scenario, number: str = "3.1", study: JointStudy | N
         For another figure.
     """
     check_type("figure_joints", scenario, Scenario, "pf.read_scenario(file)")
-    if number not in _JOINT_FIGURES:
-        raise GateError(f"figure_joints: figure {number}; known are {', '.join(_JOINT_FIGURES)}", "name-unknown")
-    name, title, quantity, label = _JOINT_FIGURES[number]
+    if number not in JOINT_FIGURES:
+        raise GateError(f"figure_joints: figure {number}; known are {', '.join(JOINT_FIGURES)}", "name-unknown")
+    name, title, quantity, label = JOINT_FIGURES[number]
     study = STUDIES[name](scenario, 0) if study is None else study
     figure = Figure(figsize=(7.2, 4.4))
     ax = figure.subplots()

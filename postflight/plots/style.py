@@ -95,7 +95,6 @@ _PARAMETERS: dict[Any, Any] = {
 }  # fmt: skip
 # formats of figures, and what matplotlib would write into each that differs from day to day or place to place
 FORMATS = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
-_DPI = 110
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -229,7 +228,7 @@ def save(figure: Figure, path: str | Path) -> None:
     form = path.suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise GateError(f"{path.name}: a figure is saved as {', '.join(FORMATS)}", "option-format")
-    figure.set_dpi(_DPI)
+    figure.set_dpi(110)
     # `savefig` draws a figure with a layout once more in vain to lay it out
     layout = figure.get_layout_engine()
     if layout is not None:
@@ -237,7 +236,7 @@ def save(figure: Figure, path: str | Path) -> None:
         figure.set_layout_engine("none")
     # no date, and in SVG no random names
     with matplotlib.rc_context({"svg.hashsalt": "postflight"}):
-        figure.savefig(path, format=form, dpi=_DPI, metadata={FORMATS[form]: None})
+        figure.savefig(path, format=form, dpi="figure", metadata={FORMATS[form]: None})
 
 
 class FigureWarning(RuntimeWarning):

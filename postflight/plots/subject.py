@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.fusing import FusedAnswer
-from estimators.loads import FlightLoads
+from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel.airdata import AirData
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
@@ -40,9 +40,16 @@ def lacking(figure: str, given: object, part: str, *wanted: str) -> GateError:
     return GateError(f"{figure}: {type(given).__name__} has no {part}; pass {' or '.join(wanted)}", "argument-type")
 
 
+def source_of(given: object) -> object:
+    """What deflections were made from, trajectory or loads; anything else is its own source."""
+    if isinstance(given, Deflections):
+        return given.loads if given.bet is None else given.bet
+    return given
+
+
 def bet_of(figure: str, given: object) -> Reconstruction | Run:
     """Trajectory, and what it was made from; `GateError` where there is none."""
-    bet = given.bet if isinstance(given, Deflections) else given
+    bet = source_of(given)
     if isinstance(bet, Reconstruction | Run):
         return bet
     raise lacking(figure, given, "trajectory", RECONSTRUCT, RUN)
@@ -50,7 +57,7 @@ def bet_of(figure: str, given: object) -> Reconstruction | Run:
 
 def reconstruction_of(figure: str, given: object, part: str) -> Reconstruction:
     """Reconstruction as it was computed, which alone has a part; `GateError` where there is none."""
-    bet = given.bet if isinstance(given, Deflections) else given
+    bet = source_of(given)
     if isinstance(bet, Reconstruction):
         return bet
     raise lacking(figure, given, part, RECONSTRUCT)
@@ -58,24 +65,21 @@ def reconstruction_of(figure: str, given: object, part: str) -> Reconstruction:
 
 def loads_of(figure: str, given: object) -> FlightLoads:
     """Motion and flow at the c.g.; `GateError` where there are none."""
-    if isinstance(given, FlightLoads):
-        return given
-    if isinstance(given, Deflections) and given.loads is not None:
-        return given.loads
-    bet = given.bet if isinstance(given, Deflections) else given
-    if isinstance(bet, Reconstruction | Run):
-        return bet.required_loads()
+    source = source_of(given)
+    if isinstance(source, FlightLoads):
+        return source
+    if isinstance(source, Reconstruction | Run):
+        return source.required_loads()
     raise lacking(figure, given, "loads", RECONSTRUCT, RUN, LOADS)
 
 
 def flow_of(figure: str, given: object) -> AirData | Flow:
     """Air data along the trajectory, or of loads; `GateError` where there are none."""
-    bet = given.bet if isinstance(given, Deflections) else given
-    if isinstance(bet, Reconstruction | Run):
-        return bet.air
+    source = source_of(given)
+    if isinstance(source, Reconstruction | Run):
+        return source.air
     loads = loads_of(figure, given)
-    size = np.linalg.norm(loads.flow_yz_rad, axis=1)
-    towards = loads.flow_yz_rad / np.where(size > 0.0, size, 1.0)[:, None]
+    towards, size = lateral_and_size(loads.flow_yz_rad)
     sd = np.sqrt(np.einsum("ni,nij,nj->n", towards, loads.flow_cov, towards))
     return Flow(loads.time_s, size, sd, loads.dynamic_pressure_pa)
 
@@ -125,11 +129,10 @@ def film_of(
 
 def words_of(given: object) -> str:
     """Words for a figure's corner: the flight, whether it is synthetic, and what a what-if assumes."""
-    if isinstance(given, Deflections):
-        return words_of(given.loads if given.bet is None else given.bet)
-    if isinstance(given, Run):
-        return flight_words(given.header["flight"], bool(given.header["synthetic"]), given.changes)
-    if isinstance(given, Reconstruction | Flight):
-        flight = given if isinstance(given, Flight) else given.flight
+    source = source_of(given)
+    if isinstance(source, Run):
+        return flight_words(source.header["flight"], bool(source.header["synthetic"]), source.changes)
+    if isinstance(source, Reconstruction | Flight):
+        flight = source if isinstance(source, Flight) else source.flight
         return flight_words(flight.name, flight.telemetry.synthetic, flight.changes)
-    return f"{given.vehicle.name}: loads of a table" if isinstance(given, FlightLoads) else ""
+    return f"{source.vehicle.name}: loads of a table" if isinstance(source, FlightLoads) else ""

@@ -65,7 +65,7 @@ def figure_residuals(flown: Drawable) -> Figure:
         Where there is no trajectory, or no measurement was tried.
     """
     flight = bet_of("figure_residuals", flown)
-    table = flight.residuals if isinstance(flight, Run) else flight.solution.residuals
+    table = flight.tables["residuals"] if isinstance(flight, Run) else flight.solution.residuals
     if not table["used"].any():
         raise lacking("figure_residuals", flight, "residual", "a flight with a tracker")
     pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))

@@ -52,7 +52,7 @@ def joint_study(name: str, scenario: str, folder: Path, seed: int) -> None:
     write_csv(folder / f"{name}.csv", study.table)
     write_csv(folder / f"{name}_paper.csv", study.paper)
     write_csv(folder / f"{name}_histories.csv", joints.histories(study))
-    for number in studies.FIGURES_OF_STUDY[name]:
+    for number in (figure for figure, (own, *_) in studies.JOINT_FIGURES.items() if own == name):
         draw(folder / f"figure_{number.replace('.', '_')}.png", studies.figure_joints, chosen, number, study)
     later = f"{joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
     rows = []
