@@ -135,7 +135,7 @@ def figure_posterior(reconciliation: Reconciled, posterior: Posterior | None = N
     ----------
     reconciliation : Reconciliation
     posterior : Posterior, optional
-        Its samples; they are drawn without, which takes minutes.
+        Its samples; emcee draws them where none are given.
 
     Raises
     ------

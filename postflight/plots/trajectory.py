@@ -249,7 +249,7 @@ def figure_attitude(flown: Drawable) -> Figure:
         ax.set_ylabel(f"about body {axis} (deg)\nrms {float(np.sqrt(np.mean(off[:, k] ** 2))):.2f}")
         far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
         ax.set_ylim(-far, far)
-    figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=2, loc="outside lower left")
     axes[-1].set_xlabel(TIME)
     title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
     if not independent:
