@@ -12,10 +12,11 @@ vector of the shell against the body is ``theta * x_hat x d``; that of the body 
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 HOLE_FACTOR = 3.0
 QUANTILES = (0.05, 0.16, 0.50, 0.84, 0.95)
 QUANTILE_COLUMNS = tuple(f"theta_p{100 * p:.0f}_deg" for p in QUANTILES)
+_ANGLES_DEG = "theta_deg", "theta_sd_deg", "plane_lv_deg", "plane_sd_deg"
 UNIFORM_VAR = np.pi**2 / 3.0  # of a clocking angle that may be anything
 
 
@@ -109,16 +111,9 @@ class DeflectionHistory(Tabular):
         plane_sd = np.full(len(self.time_s), np.nan)
         if self.covariance is not None:
             plane_sd = np.sqrt(self.covariance[:, 1, 1])
-        table = pd.DataFrame(
-            {
-                "t_s": self.time_s,
-                "theta_deg": np.rad2deg(self.theta_rad),
-                "theta_sd_deg": np.rad2deg(self.theta_sd_rad),
-                "plane_lv_deg": np.rad2deg(self.plane_lv_rad),
-                "plane_sd_deg": np.rad2deg(plane_sd),
-            }
-            | dict(zip(QUANTILE_COLUMNS, np.rad2deg(self.theta_quantiles_rad).T, strict=True))
-        )
+        angles = self.theta_rad, self.theta_sd_rad, self.plane_lv_rad, plane_sd, *self.theta_quantiles_rad.T
+        names = *_ANGLES_DEG, *QUANTILE_COLUMNS
+        table = pd.DataFrame({"t_s": self.time_s} | dict(zip(names, np.rad2deg(angles), strict=True)))
         return table[np.isfinite(self.theta_rad)]
 
     def _about(self) -> str:
@@ -187,7 +182,7 @@ class DeflectionHistory(Tabular):
         size = np.where(inside, self.theta_rad, np.nan) if inside.any() else self.theta_rad
         return int(np.nanargmax(np.abs(size)))
 
-    def at(self, time_s: float) -> tuple[float, float]:
+    def angle_at(self, time_s: float) -> tuple[float, float]:
         """Angle and its sd, rad, at one time by linear interpolation between answers; NaN outside them and in holes.
 
         A hole is a distance between answers of more than three times the usual one. The sd holds what a straight line
@@ -204,6 +199,43 @@ class DeflectionHistory(Tabular):
         missed = interpolation_error(t, theta, time_s)
         return float(np.interp(time_s, t, theta)), float(np.hypot(np.interp(time_s, t, sd), missed))
 
+    def at(self, time_s: float) -> pd.Series:
+        """Answer at one time, in degrees, by interpolation between answers (`angle_at`).
+
+        Parameters
+        ----------
+        time_s : float
+
+        Returns
+        -------
+        Series
+            ``t_s, theta_deg, theta_sd_deg, plane_lv_deg, plane_sd_deg``. All but the time are NaN outside the answers
+            and in holes.
+        """
+        import pandas as pd
+
+        theta, sd = self.angle_at(time_s)
+        plane, plane_sd = np.nan, np.nan
+        if np.isfinite(theta):
+            known = np.isfinite(self.theta_rad)
+            t = self.time_s[known]
+            plane = float(lv_clock(np.array([np.interp(time_s, t, c) for c in self.theta_yz_rad[known].T])))
+            if self.covariance is not None:
+                plane_sd = float(np.interp(time_s, t, np.sqrt(self.covariance[known, 1, 1])))
+        degrees = dict(zip(_ANGLES_DEG, np.rad2deg([theta, sd, plane, plane_sd]), strict=True))
+        return pd.Series({"t_s": float(time_s)} | degrees, name=self.method)
+
+    def plot(self) -> Any:
+        """Figure of angle and plane over time with a band of one standard deviation.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            That of ``postflight.plots.figure_deflection``.
+        """
+        # figures belong to the floor above, which is named here and not imported
+        return pkgutil.resolve_name("postflight.plots:figure_deflection")(self)
+
 
 _CLEAR_SD = 4.0  # of a cycle: a minimum lies so many sd below its neighbouring maxima
 
@@ -213,7 +245,7 @@ def cycle_about(history: DeflectionHistory, at_s: float) -> tuple[float, float] 
 
     A minimum counts where the angle rises to both sides by `_CLEAR_SD` of its sd at ``at_s``.
     """
-    sd = history.at(at_s)[1]
+    sd = history.angle_at(at_s)[1]
     known = np.isfinite(history.theta_rad)
     if not np.isfinite(sd):
         return None

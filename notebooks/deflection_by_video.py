@@ -23,12 +23,11 @@
 # %matplotlib inline
 import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from IPython.display import Image, display
+from IPython.display import display
 
 import postflight as pf
 
@@ -58,9 +57,7 @@ for axis, k in zip(axes, (frames.benchmark, late), strict=True):
 
 # %%
 history = pf.estimate_camera(flight)
-with TemporaryDirectory() as pictures:
-    pf.plots.draw_camera(flight, history, Path(pictures))
-    display(Image((Path(pictures) / "figure_2_3.png").read_bytes()))
+display(pf.plots.figure_2_3(flight, history))
 history
 
 # %% [markdown]

@@ -22,11 +22,10 @@
 # %matplotlib inline
 import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
-from IPython.display import Image, display
+from IPython.display import display
 
 import postflight as pf
 
@@ -93,13 +92,11 @@ answer = pf.fuse(bet)
 answer
 
 # %%
-pf.plots.figure_2_7(bet, answer.histories["misalignment"])
+pf.plots.figure_2_7(answer)
 
 # %%
-if "camera" in answer.histories:
-    with TemporaryDirectory() as pictures:
-        pf.plots.draw_camera(flight, answer.histories["camera"], Path(pictures))
-        display(Image((Path(pictures) / "figure_2_3.png").read_bytes()))
+if "camera" in answer:
+    display(pf.plots.figure_2_3(answer))
 
 # %% [markdown]
 # ## The claim
@@ -109,7 +106,7 @@ if "camera" in answer.histories:
 
 # %%
 grid = np.arange(bet.peak_s - 6.0, bet.peak_s + 6.0, 0.1)
-at = {m: np.array([h.at(t) for t in grid]) for m, h in answer.histories.items()}
+at = {m: np.array([answer[m].at(t)[["theta_deg", "theta_sd_deg"]] for t in grid]) for m in answer}
 names = list(at)
 for k, one in enumerate(names):
     for other in names[k + 1 :]:
@@ -128,4 +125,4 @@ for k, one in enumerate(names):
 if (folder / "truth" / "deflection.csv").exists():
     truth = pd.read_csv(folder / "truth" / "deflection.csv")
     overlay = (truth["t_s"].to_numpy(), truth["theta_deg"].to_numpy())
-    display(pf.plots.figure_summary(bet, answer, overlay))
+    display(pf.plots.figure_summary(answer, truth=overlay))

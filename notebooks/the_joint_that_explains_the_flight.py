@@ -66,7 +66,7 @@ table.round(4)
 # %%
 modal = joint_found.modal_stiffness()
 print(f"by its frequency alone: {modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad")
-pf.plots.figure_modes(modal, flight.telemetry)
+pf.plots.figure_modes(joint_found, modal)
 
 # %% [markdown]
 # ## A rigid vehicle does not fly like that; one with this joint does

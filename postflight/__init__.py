@@ -7,6 +7,7 @@
     answer = pf.fuse(bet)                       # the deflection by every method, and fused
     answer = pf.fuse(pf.read_loads("bet.csv", "vehicle.toml"))  # the same on another team's trajectory
     changed = flight.with_(c_n=1.1, wind=None)  # a what-if is a changed flight
+    run = pf.read_run("my-flight")              # what `postflight run` left: run.trajectory, run.air, run.deflections
 
 Every result prints itself in one line, shows as a table in a notebook, and gives its data by ``to_frame()`` with units
 in the column names. Everything that is not listed here is internal.
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from postflight.loads_table import read_loads
     from postflight.reconciliation.command import reconcile
     from postflight.reconstruction import Reconstruction, air_data, reconstruct
+    from postflight.runs import Run, read_run
     from recon.settings import Settings
     from synthetic_flight.scenarios import read_scenario
 
@@ -67,6 +69,7 @@ _DOOR = {
         "recon.settings": "Settings",
         "flightmodel.trajectory": "Trajectory",
         "postflight.loads_table": "read_loads",
+        "postflight.runs": "read_run Run",
         "estimators.loads": "FlightLoads",
         "postflight.deflections": "Deflections aero_increments estimate_camera estimate_misalignment estimate_trim "
         "fuse",
@@ -87,6 +90,7 @@ __all__ = [
     "FlightLoads",
     "GateError",
     "Reconstruction",
+    "Run",
     "Settings",
     "Trajectory",
     "aero_increments",
@@ -102,6 +106,7 @@ __all__ = [
     "plots",
     "read_flight",
     "read_loads",
+    "read_run",
     "read_scenario",
     "read_vehicle",
     "reconcile",

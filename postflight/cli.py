@@ -337,9 +337,7 @@ def deflection(
     elif vehicle is None or loads is None:
         raise click.UsageError("--loads wants --vehicle FILE: mass properties and coefficients")
     else:
-        from postflight.loads_table import deflection_of_table
-
-        deflection_of_table(Path(loads), vehicle, methods, columns, errors, place)
+        commands.deflection_of_table(Path(loads), vehicle, methods, columns, errors, place)
 
 
 @cli.command()
@@ -368,16 +366,17 @@ def calibrate(corners: Path, size: str, lens: Literal["fisheye", "pinhole"]) -> 
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option("--timings", is_flag=True, help="Print how long each stage took.")
+@click.option("--figures", "formats", multiple=True, type=NamedChoice(["pdf", "svg"]), help="Draw figures so too.")
 @strict_option
 @what_ifs
 @click.pass_obj
-def run(begun: float, folder: Path, timings: bool, strict: bool, changed: WhatIfs) -> None:
+def run(begun: float, folder: Path, timings: bool, formats: tuple[str, ...], strict: bool, changed: WhatIfs) -> None:
     """Do it all for the flight in FOLDER: trajectory, three deflection estimates fused, tables, figures."""
     from postflight import commands
     from postflight.deflections import METHODS
 
     stages = commands.Stages(begun)
-    commands.run(folder, METHODS, commands.asked(*changed), stages=stages, strict=strict)
+    commands.run(folder, METHODS, commands.asked(*changed), stages=stages, formats=formats, strict=strict)
     if timings:
         commands.print_stages(stages)
 

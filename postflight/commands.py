@@ -22,10 +22,14 @@ from rich.table import Table
 
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
+from flightmodel.config import parse_section
+from flightmodel.files import write_file
+from flightmodel.vehicle import read_vehicle
 from postflight import run_folder, warmup
 from postflight.beside import Beside, Task, same
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
+from postflight.plots.style import FigureFolder
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
@@ -164,7 +168,7 @@ def print_stages(stages: Stages) -> None:
 
 def run(
     folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False, stages: Stages | None = None,
-    strict: bool = False,
+    formats: tuple[str, ...] = (), strict: bool = False,
 ) -> None:  # fmt: skip
     """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
 
@@ -177,7 +181,7 @@ def run(
         if methods:
             print_answers(answers)
 
-    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages)
+    _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages, formats)
     print_increments(answers)
     if (written / "sensitivity.csv").is_file():
         print_sensitivity(run_folder.read_csv(written / "sensitivity.csv"))
@@ -194,8 +198,8 @@ class _Figures:
 
     bet: Task[Reconstruction]
 
-    def __init__(self, beside: Beside, folder: Path) -> None:
-        self._beside, self._folder = beside, folder
+    def __init__(self, beside: Beside, folder: Path, formats: tuple[str, ...]) -> None:
+        self._beside, self._folder = beside, FigureFolder(folder, ("png", *formats))
         self._parts: list[Task[None]] = []
 
     def draw(self, part: str, *arguments: Any) -> None:
@@ -211,9 +215,11 @@ class _Figures:
 def run_flight(
     folder: Path, methods: tuple[str, ...], asked_for: Asked, reruns: bool = False,
     show_answers: Callable[[Reconstruction, Deflections, pd.DataFrame], None] = lambda *_: None,
-    stages: Stages | None = None,
+    stages: Stages | None = None, formats: tuple[str, ...] = (),
 ) -> tuple[Reconstruction, Deflections, Path]:  # fmt: skip
     """Run the chain on one flight folder and write its run folder; ``reruns`` asks for the sensitivity too.
+
+    Figures are drawn as PNG, and in other ``formats``.
 
     ``show_answers`` is called with trajectory, deflections and events before tables and report are written. The film is
     read and figures are drawn beside it as soon as their numbers are there.
@@ -243,7 +249,7 @@ def run_flight(
         new = run_folder.RunFolder(folder, flight.telemetry, settings, asked_for.name, flight.as_read)
         with new as out, closing(beside):
             with progress_bar() as report:
-                figures = _Figures(beside, out.path / "figures")
+                figures = _Figures(beside, out.path / "figures", formats)
                 bet, answers = _answered(flight, methods, figures, steps(report), stages, beside)
             event_rows = run_folder.event_table(bet, bet.table)
             show_answers(bet, answers, event_rows)
@@ -269,7 +275,7 @@ def run_flight(
                 (out.path / "log.jsonl").write_text(lines)
                 out.keep(run_folder.summary(bet, answers, event_rows))
                 with out.part("report"):
-                    write_report(folder, out.path, flight.telemetry)
+                    write_report(folder, out.path, flight)
                 stages.end("report")
                 figures.wait()
                 stages.end("figures that were not drawn meanwhile")
@@ -542,9 +548,9 @@ def deflection(
                 history = answers.histories["camera"]
                 draw_camera(flight, history, out.path / "figures")
                 if film:
-                    for name, (seen, own) in by_camera(telemetry, history).items():
+                    for name in by_camera(telemetry, history):
                         file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
-                        write_overlay_film(seen, own, out.path / "figures" / file, progress=report)
+                        write_overlay_film(flight, out.path / "figures" / file, history, name, report)
     for words, code in few_of_each(telemetry.findings):
         console.coded("[yellow]found[/]", words, code)
     if trouble:
@@ -559,6 +565,32 @@ def deflection(
     console.print(f"results in {escape(str(out.path))}")
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
+
+
+def deflection_of_table(
+    table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], errors: tuple[str, ...], place: str
+) -> None:
+    """Estimate, print, and write a table a method beside the table of loads, in ``<stem>-deflection``."""
+    from estimators.loads import LoadsErrors
+    from postflight.loads_table import loads_and_unused
+
+    pairs = dict(text.partition("=")[::2] for text in columns)
+    changes = asked(errors, (), None).changes
+    made, stated = read_vehicle(vehicle), parse_section(LoadsErrors, changes, "--set")
+    loads, unused = loads_and_unused(table, made, pairs, place, stated)
+    compile_kernels("balance")
+    answers = estimate(loads, methods or tuple(name for name in METHODS if name != "camera"))
+    folder = table.with_name(f"{table.stem}-deflection")
+    folder.mkdir(exist_ok=True)
+    for method, history in answers.histories.items():
+        content = history.to_frame().to_csv(index=False, float_format=run_folder.DIGITS, lineterminator="\n")
+        write_file(folder / f"deflection_{method}.csv", content)
+    print_answers(answers)
+    defaults = (f"{key} = {size}" for key, size in LoadsErrors().model_dump().items() if key not in changes and size)
+    console.print(f"{len(loads.time_s)} rows of {table}; errors not stated there: {', '.join(defaults)}", markup=False)
+    if unused:
+        console.print(f"columns not used: {', '.join(unused)}", markup=False)
+    console.print(f"tables in {folder}", markup=False)
 
 
 def calibrate(corners: Path, size: str, lens: Lens) -> None:

@@ -25,7 +25,7 @@ from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, difference, resample
 from postflight.deflections import METHODS
 from postflight.run_folder import value_and_sd
-from postflight.runs import RunTables, trajectory_of
+from postflight.runs import Run, trajectory_of
 
 Sd = TypeVar("Sd", float, pd.Series)
 MOST_RUNS = 6  # that strokes and colours keep apart
@@ -68,12 +68,12 @@ class RunComparison(Tabular):
 
     Parameters
     ----------
-    runs : tuple of RunTables
+    runs : tuple of Run
     labels : tuple of str
         What each is called, all different.
     """
 
-    runs: tuple[RunTables, ...]
+    runs: tuple[Run, ...]
     labels: tuple[str, ...]
 
     @cached_property
@@ -164,7 +164,7 @@ class RunComparison(Tabular):
         return f"{len(self.runs)} runs, {len(self.quantities)} quantities: {'; '.join(self.labels)}"
 
 
-def compare_runs(runs: tuple[RunTables, ...]) -> RunComparison:
+def compare_runs(runs: tuple[Run, ...]) -> RunComparison:
     """Set complete runs side by side.
 
     Raises
@@ -188,7 +188,7 @@ def sd_bounds(first_sd: Sd, other_sd: Sd) -> tuple[Sd, Sd]:
     return abs(first_sd - other_sd), first_sd + other_sd
 
 
-def _labels(runs: tuple[RunTables, ...]) -> tuple[str, ...]:
+def _labels(runs: tuple[Run, ...]) -> tuple[str, ...]:
     """Names; else changes, else that there are none; with the flight's where there are several."""
     several = len({run.header["flight"] for run in runs}) > 1
     out = []
@@ -202,7 +202,7 @@ def _labels(runs: tuple[RunTables, ...]) -> tuple[str, ...]:
     )
 
 
-def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
+def _values(run: Run, at_s: float) -> dict[str, tuple[float, float]]:
     bet, nothing = run.tables["bet"], (float("nan"), float("nan"))
     out = {"peak_s": (run.peak_s, np.nan)}
     inside = bet["t_s"].iloc[0] <= at_s <= bet["t_s"].iloc[-1]
@@ -213,7 +213,7 @@ def _values(run: RunTables, at_s: float) -> dict[str, tuple[float, float]]:
         history = run.history(method)
         if history is None:
             continue
-        theta, sd = np.rad2deg(history.at(at_s))
+        theta, sd = np.rad2deg(history.angle_at(at_s))
         out[f"deflection_{method}_deg"] = float(theta), float(sd)
         out[f"largest_{method}_deg"] = run.summary["methods"][method].get("largest_deg", np.nan), np.nan
     return out
@@ -228,7 +228,7 @@ def _near(bet: pd.DataFrame, column: str, at_s: float) -> tuple[float, float]:
     return value_and_sd(known, column, at_s)
 
 
-def _relation(first: RunTables, other: RunTables) -> Relation:
+def _relation(first: Run, other: Run) -> Relation:
     a, b = (run.facts["inputs_sha256"] for run in (first, other))
     shared = set(a.values()) & set(b.values())
     if not shared:
@@ -238,7 +238,7 @@ def _relation(first: RunTables, other: RunTables) -> Relation:
     return Relation(CORRELATED, words)
 
 
-def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
+def _over_time(first: Run, other: Run) -> pd.DataFrame:
     """Differences of a run to the first one at the first one's times that both cover, over the pulse and about it."""
     a, b = first.tables["bet"], other.tables["bet"]
     rows = a["t_s"].between(b["t_s"].iloc[0], b["t_s"].iloc[-1])
@@ -256,7 +256,7 @@ def _over_time(first: RunTables, other: RunTables) -> pd.DataFrame:
 
 
 def _angle_deg(history: DeflectionHistory, time_s: FloatArray) -> FloatArray:
-    """Angle at many times, as `DeflectionHistory.at` has it at one: NaN outside the answers and in holes."""
+    """Angle at many times, as `DeflectionHistory.angle_at` has it at one: NaN outside the answers and in holes."""
     t, step = history.time_s, np.diff(history.time_s)
     if len(t) < 2:
         return np.full(len(time_s), np.nan)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -11,8 +12,8 @@ import pandas as pd
 
 from estimators.loads import FlightLoads
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, part_of
-from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, lv_clock, mean_over
+from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, nearest_name, part_of
+from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, mean_over
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
 from postflight.flight import NO_VIDEO, READ, RECONSTRUCT, Flight
@@ -38,6 +39,8 @@ PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 class Deflections(Tabular):
     """Deflection histories by method, why a method gave none, and what stands behind the fused one.
 
+    ``answer["camera"]`` is the history of a method, and ``for method in answer`` goes through those that answered.
+
     Parameters
     ----------
     histories : dict of DeflectionHistory
@@ -47,9 +50,12 @@ class Deflections(Tabular):
     fused : FusedAnswer or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
     camera : CameraAnswer or None
-        What stands behind the camera's, of one camera or several, and its answer at any time.
+        What stands behind the camera's, of one camera or several.
+    smooth_camera : DeflectionHistory or None
+        The camera's answer at any time; None in an assumed plane, or of too few frames.
     bet : Reconstruction or None
-        What they were made from; None where the camera answered without a trajectory, or ``loads`` did.
+        What they were made from, or the run that they were read back from, which has the same parts; None where the
+        camera answered without a trajectory, or ``loads`` did.
     loads : FlightLoads or None
         What they were made from instead, of another team's trajectory (`read_loads`).
     increments : AeroIncrements or None
@@ -61,10 +67,23 @@ class Deflections(Tabular):
     refused: dict[str, Issue] = field(default_factory=dict)
     fused: FusedAnswer | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
+    smooth_camera: DeflectionHistory | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
     loads: FlightLoads | None = field(default=None, compare=False)
     increments: AeroIncrements | None = field(default=None, compare=False)
     no_increments: Issue | None = None
+
+    def __getitem__(self, method: str) -> DeflectionHistory:
+        """History of a method; `KeyError` with the reason, or with the methods that answered."""
+        if method in self.histories:
+            return self.histories[method]
+        answered = f"there are answers of: {', '.join(self.histories) or 'no method'}"
+        known = self.refused.get(method, f"not asked for{nearest_name(method, METHODS)}")
+        raise KeyError(f"{method}: {known}; {answered}")
+
+    def __iter__(self) -> Iterator[str]:
+        """Methods that answered."""
+        return iter(self.histories)
 
     @property
     def history(self) -> DeflectionHistory:
@@ -78,11 +97,6 @@ class Deflections(Tabular):
     def continuous(self) -> dict[str, DeflectionHistory]:
         """Each method's answer at any time: of the camera, between whose frames the shell swings, the smooth one."""
         return self.histories | ({} if self.smooth_camera is None else {"camera": self.smooth_camera})
-
-    @property
-    def smooth_camera(self) -> DeflectionHistory | None:
-        """The camera's answer at any time; None in an assumed plane, or of too few frames."""
-        return None if self.camera is None or "camera" not in self.histories else self.camera.smooth
 
     @property
     def knows_peak(self) -> bool:
@@ -112,7 +126,7 @@ class Deflections(Tabular):
     @property
     def best(self) -> str | None:
         """The fused answer, else the method of the smallest sd at `reference_s`; None where none answers there."""
-        at = {method: history.at(self.reference_s)[1] for method, history in self.continuous.items()}
+        at = {method: history.angle_at(self.reference_s)[1] for method, history in self.continuous.items()}
         if np.isfinite(at.get("fused", np.nan)):
             return "fused"
         return min((m for m, sd in at.items() if np.isfinite(sd)), key=lambda m: at[m], default=None)
@@ -157,11 +171,8 @@ class Deflections(Tabular):
         at_s, cycle = self.reference_s, self.cycle_s
         for method, history in self.histories.items():
             any_time = self.continuous[method]
-            theta, sd = np.rad2deg(any_time.at(at_s))
-            known = np.isfinite(any_time.theta_rad)
-            lateral = [np.interp(at_s, any_time.time_s[known], c[known]) for c in any_time.theta_yz_rad.T]
+            _, theta, sd, plane, _ = any_time.at(at_s)
             k = history.largest(self.pulse_s)
-            plane = np.rad2deg(lv_clock(np.array(lateral))) if np.isfinite(theta) else np.nan
             largest = np.rad2deg(history.theta_rad[k]), history.time_s[k]
             reason = "" if np.isfinite(theta) else str(no_answer_at(any_time, at_s))
             mean = np.rad2deg(mean_over(any_time, cycle)) if cycle is not None else (np.nan, np.nan)
@@ -176,7 +187,7 @@ class Deflections(Tabular):
     def _about(self) -> str:
         shown = []
         for method, history in self.continuous.items():
-            theta, sd = np.rad2deg(history.at(self.reference_s))
+            theta, sd = np.rad2deg(history.angle_at(self.reference_s))
             known = f"{theta:.2f} +/- {sd:.2f} deg" if np.isfinite(theta) else no_answer_at(history, self.reference_s)
             shown.append(f"{method} {known}")
         answers = f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
@@ -202,8 +213,8 @@ def no_answer_at(history: DeflectionHistory, at_s: float) -> Issue:
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
-    """Quantiles (5,) of the angle at a time, rad, between answers as wide as the sd of `at`; NaN without one."""
-    quantiles, (theta, sd) = history.theta_quantiles_rad, history.at(at_s)
+    """Quantiles (5,) of the angle at a time, rad, between answers as wide as the sd of `angle_at`; NaN without one."""
+    quantiles, (theta, sd) = history.theta_quantiles_rad, history.angle_at(at_s)
     known = np.isfinite(quantiles).all(axis=1)
     if not np.isfinite(theta) or not known.any():
         return np.full(len(QUANTILE_COLUMNS), np.nan)
@@ -373,7 +384,8 @@ def estimate(
     report(1.0, "estimated")
     histories = {m: answers.histories[m] for m in methods if m in answers.histories}
     refused = {m: answers.refused[m] for m in methods if m in answers.refused}
-    return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed)
+    smooth = filmed.smooth if filmed is not None and "camera" in histories else None
+    return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed, smooth_camera=smooth)
 
 
 def with_increments(answers: Deflections) -> Deflections:

@@ -27,7 +27,6 @@ the instrument's: our ``q_body_ecef``, scalar first.
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -43,10 +42,10 @@ from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError, FloatArray, GateError
 from flightmodel.config import parse_utc
 from flightmodel.earth import undulation_m
-from flightmodel.files import file_bytes, open_file, write_file, writing
+from flightmodel.files import open_file, write_file, writing
 from postflight.intake.stored_tables import missing_library
-from postflight.run_folder import DIGITS, read_csv
-from postflight.runs import find_run
+from postflight.run_folder import DIGITS
+from postflight.runs import read_run
 from postflight.terminal import terminal
 
 _UNITS = {
@@ -117,24 +116,19 @@ class Source:
 
 
 def read_source(folder: Path, wanted: str | None = None) -> Source:
-    """Read a run (`find_run`); `GateError` where there is none or its files are incomplete."""
-    run = find_run(folder, wanted)
+    """Read a run (`read_run`); `GateError` where there is none or its files are incomplete."""
+    run = read_run(folder, wanted)
     try:
-        header = json.loads(file_bytes(run / "bet_header.json"))
-        facts = json.loads(file_bytes(run / "run.json"))
-        trajectory = read_csv(run / "bet.csv")
-        events = read_csv(run / "events.csv")
-        with open_file(run / "covariance.npz") as file, np.load(file, allow_pickle=False) as stored:
+        with open_file(run.path / "covariance.npz") as file, np.load(file, allow_pickle=False) as stored:
             times, covariance = stored["t_s"], stored["covariance"]
-    except FileNotFoundError as fault:
-        words = f"has no {Path(str(fault.filename)).name}: it made no trajectory; `postflight run {folder}` does"
-        raise GateError(f"{run}: {words}", "input-missing") from None
     except (ValueError, KeyError, OSError) as fault:
-        raise GateError(f"{run}: cannot be read back ({fault}); run it again", "run-incomplete") from None
-    deflections = {p.stem.removeprefix("deflection_"): read_csv(p) for p in sorted(run.glob("deflection_*.csv"))}
+        raise GateError(f"{run.path}: cannot be read back ({fault}); run it again", "run-incomplete") from None
+    stems = (stem for stem in run.tables if stem.startswith("deflection_"))
+    deflections = {stem.removeprefix("deflection_"): run.tables[stem] for stem in stems}
+    header, finished = run.header, run.facts["finished_utc"]
     return Source(
-        header["flight"], run.name, parse_utc(header["epoch_utc"]), facts["finished_utc"], bool(header["synthetic"]),
-        header, trajectory, events, deflections, times, covariance,
+        header["flight"], run.path.name, parse_utc(header["epoch_utc"]), finished, bool(header["synthetic"]),
+        header, run.table, run.tables["events"], deflections, times, covariance,
     )  # fmt: skip
 
 

@@ -362,9 +362,10 @@ def is_oriented(telemetry: Telemetry, frames: Frames) -> bool:
 def by_camera(telemetry: Telemetry, history: DeflectionHistory) -> dict[str, tuple[Telemetry, DeflectionHistory]]:
     """Telemetry with one camera, and the history at its frames (NaN where it has no answer), of each camera with some.
 
-    Of one camera alone, both as they are; of several, those that their benchmark frame orients.
+    Of one camera alone with an answer or NaN at every frame, both as they are; else those cameras that their benchmark
+    frame orients. A history that was read back has no rows where there is no answer.
     """
-    if len(telemetry.films) < 2:
+    if len(telemetry.films) == 1 and all(np.array_equal(history.time_s, f.time_s) for f in telemetry.films.values()):
         return dict.fromkeys(telemetry.films, (telemetry, history))
     out = {}
     for name, frames in telemetry.films.items():
@@ -372,9 +373,8 @@ def by_camera(telemetry: Telemetry, history: DeflectionHistory) -> dict[str, tup
         there = np.abs(history.time_s[nearest] - frames.time_s) < _SAME_FRAME_S
         theta = np.where(there, history.theta_rad[nearest], np.nan)
         cov = None if history.covariance is None else history.covariance[nearest]
-        own = replace(
-            history, time_s=frames.time_s, theta_rad=theta, plane_lv_rad=history.plane_lv_rad[nearest], covariance=cov
-        )
+        plane = history.plane_lv_rad[nearest]
+        own = DeflectionHistory(frames.time_s, theta, plane, cov, history.method, history.assumptions)
         if np.isfinite(theta).any() and is_oriented(telemetry, frames):
             out[name] = (replace(telemetry, films={name: frames}), own)
     return out

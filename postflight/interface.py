@@ -274,5 +274,5 @@ def _at_peak(answer: Deflections, method: str) -> tuple[float, float]:
     """Deflection and its sd, deg; NaN where the method gave none."""
     if method not in answer.histories:
         return float("nan"), float("nan")
-    theta, sd = answer.continuous[method].at(answer.reference_s)
+    theta, sd = answer.continuous[method].angle_at(answer.reference_s)
     return float(np.rad2deg(theta)), float(np.rad2deg(sd))

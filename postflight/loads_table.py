@@ -30,17 +30,12 @@ from flightmodel.atmosphere import sound_speed, us76
 from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.config import parse_section
 from flightmodel.deflection import lv_direction
-from flightmodel.files import write_file
 from flightmodel.tables import read_unit, to_si
 from flightmodel.vehicle import Vehicle, read_vehicle
 from postflight.intake.column_recognition import Recogniser, SourceProposal, column_unit
 from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import ColumnName
 from postflight.intake.stored_tables import read_tables
-from postflight.run_folder import DIGITS
-from postflight.terminal import terminal
-
-console = terminal()
 
 
 class _Meaning(NamedTuple):
@@ -67,6 +62,11 @@ _OWN = {
     "ax": "ax_cg_mps2", "ay": "ay_cg_mps2", "az": "az_cg_mps2",
     "p": "p_body_degps", "q": "q_body_degps", "r": "r_body_degps", "wind_sd": "wind_sd_mps",
 }  # fmt: skip
+# all of its columns that loads are made from
+LOADS_COLUMNS = (
+    "t_s", *_OWN.values(), "mach", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", "airspeed_mps", "alt_m",
+    "alpha_total_wind_deg", "alpha_total_wind_sd_deg", "clock_lv_deg",
+)  # fmt: skip
 _FORCE, _RATES = ("ax", "ay", "az"), ("p", "q", "r")
 _TRIADS = {"sensors.accelerometer": _FORCE, "sensors.rates": _RATES}
 # a day's temperature departs from the standard by a fifth at the most, in the mesosphere; the root of that
@@ -134,13 +134,18 @@ def read_loads(
     """
     stated = parse_section(LoadsErrors, errors, "read_loads")
     made = vehicle if isinstance(vehicle, Vehicle) else read_vehicle(vehicle)
-    return _loads(table, made, dict(columns or {}), _cg_from_sensor(made, acceleration_at), stated)[0]
+    return loads_and_unused(table, made, dict(columns or {}), acceleration_at, stated)[0]
 
 
-def _loads(
-    table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: dict[str, str], arm_m: FloatArray, errors: LoadsErrors
+def loads_and_unused(
+    table: str | Path | pd.DataFrame,
+    vehicle: Vehicle,
+    columns: dict[str, str],
+    acceleration_at: str | tuple[float, float, float],
+    errors: LoadsErrors,
 ) -> tuple[FlightLoads, list[str]]:
     """Loads, and the names of the table's columns that were not used."""
+    arm_m = _cg_from_sensor(vehicle, acceleration_at)
     found = _read(_as_table(table), columns)
     loads = loads_from_arrays(vehicle, _columns(found), errors, arm_m)
     _check(found.label, loads)
@@ -383,37 +388,3 @@ def _axial_ratio(loads: FlightLoads) -> FloatArray:
     axial = np.array([vehicle.aero.at(m, a)[0] for m, a in zip(loads.mach, angle, strict=True)])
     force = axial * vehicle.reference.area_m2 * loads.dynamic_pressure_pa / vehicle.mass_kg
     return np.asarray(-loads.specific_force_body_mps2[:, 0] / force)
-
-
-# the command
-
-
-def deflection_of_table(
-    table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], errors: tuple[str, ...], place: str
-) -> None:
-    """Estimate, print, and write a table a method beside the table of loads, in ``<stem>-deflection``."""
-    from postflight.commands import asked, compile_kernels, print_answers
-    from postflight.deflections import METHODS, estimate
-
-    pairs = dict(text.partition("=")[::2] for text in columns)
-    made, stated = read_vehicle(vehicle), parse_section(LoadsErrors, asked(errors, (), None).changes, "--set")
-    loads, unused = _loads(table, made, pairs, _cg_from_sensor(made, place), stated)
-    compile_kernels("balance")
-    answers = estimate(loads, methods or tuple(name for name in METHODS if name != "camera"))
-    folder = table.with_name(f"{table.stem}-deflection")
-    folder.mkdir(exist_ok=True)
-    for method, history in answers.histories.items():
-        content = history.to_frame().to_csv(index=False, float_format=DIGITS, lineterminator="\n")
-        write_file(folder / f"deflection_{method}.csv", content)
-    print_answers(answers)
-    assumed = ", ".join(_defaults(errors))
-    console.print(f"{len(loads.time_s)} rows of {table}; errors not stated there: {assumed}", markup=False)
-    if unused:
-        console.print(f"columns not used: {', '.join(unused)}", markup=False)
-    console.print(f"tables in {folder}", markup=False)
-
-
-def _defaults(stated: tuple[str, ...]) -> list[str]:
-    """Errors that the defaults stand for, as ``--set`` takes them."""
-    said = {text.partition("=")[0].strip() for text in stated}
-    return [f"{key} = {value}" for key, value in LoadsErrors().model_dump().items() if key not in said and value]

@@ -252,7 +252,7 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
     cycle = answers.cycle_s
     for method, history in answers.histories.items():
         any_time = answers.continuous[method]
-        theta, sd = np.rad2deg(any_time.at(at_s))
+        theta, sd = np.rad2deg(any_time.angle_at(at_s))
         largest = history.largest(answers.pulse_s)
         quantiles = np.rad2deg(quantiles_at(any_time, at_s))
         out[method] = {

@@ -258,7 +258,7 @@ def _method_row(path: Path, at_s: float, true_deg: float) -> dict[str, Any]:
     row: dict[str, Any] = {"deflection_deg": None, "sd_deg": None, "truth_deg": true_deg, "error_deg": None}
     if not path.is_file():
         return row
-    theta, sd = np.rad2deg(_history(path).at(at_s))
+    theta, sd = np.rad2deg(_history(path).angle_at(at_s))
     if np.isfinite(theta) and np.isfinite(sd):
         row |= {"deflection_deg": float(theta), "sd_deg": float(sd), "error_deg": float(theta) - true_deg}
     return row

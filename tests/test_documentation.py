@@ -11,6 +11,7 @@ import pytest
 from pydantic import BaseModel
 
 from flightmodel import aerodynamics, tables
+from postflight import plots
 from postflight.cli import cli
 from postflight.intake.flight_form import template_keys
 from postflight.montecarlo import study
@@ -118,6 +119,14 @@ def test_commands_on_the_page_are_understood(page: Path, monkeypatch: pytest.Mon
 def test_python_on_the_page_compiles(page: Path):
     for text in blocks(page, "python"):
         compile(text, page.name, "exec")
+
+
+def test_the_gallery_has_every_figure_and_no_other_picture():
+    """tests/whole/test_examples.py executes its calls, tools/gallery.py draws its pictures."""
+    page = (DOCS / "figures.md").read_text()
+    assert [name for name in plots.__all__ if name.startswith("figure_") and name not in page] == []
+    shown = set(re.findall(r"\]\(images/gallery/(\S+)\)", page))
+    assert shown == {path.name for path in (DOCS / "images" / "gallery").iterdir()}
 
 
 def message_codes() -> ModuleType:

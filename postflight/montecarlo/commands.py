@@ -69,9 +69,8 @@ def finish(study: Study, folder: Path, flights: int) -> Merged:
     """Merge, write, draw, print."""
     merged = merge(study, folder, flights)
     write_merged(folder, merged)
-    title = f"{flights} dispersed flights: 2.3, 50 and 97.7 % of them"
     if len(merged.bands):
-        draw(folder / "bands.png", figure_bands, merged.bands, title, _origin(study))
+        draw(folder / "bands.png", figure_bands, merged, _origin(study))
     _print_merged(merged, folder)
     if merged.summary["failed"] == flights:
         message = f"{folder}: every flight failed; the first: {merged.flights['reason'].iloc[0]}"

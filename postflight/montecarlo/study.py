@@ -259,7 +259,7 @@ def whole_trial(plan: Plan, seed: int, run: int) -> dict[str, float]:
     out = dict.fromkeys(TRIAL_SCALARS, np.nan)
     out["truth_deg"] = float(np.rad2deg(np.interp(peak_s, truth.time_s, truth.deflection.theta_rad)))
     for method, history in answers.continuous.items():
-        theta, sd = np.rad2deg(history.at(peak_s))
+        theta, sd = np.rad2deg(history.angle_at(peak_s))
         out |= {f"{method}_deg": float(theta), f"{method}_sd_deg": float(sd)}
         out[f"{method}_error_deg"] = float(theta) - out["truth_deg"]
     at = np.array([peak_s])

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from estimators.fusion import Fused
 from estimators.southwell import SPAN_S, Limbs
-from flightmodel.checks import FloatArray
-from postflight.deflections import Deflections
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory
+from postflight.deflections import Deflections, with_increments
 from postflight.flown_coefficients import AeroIncrements
 from postflight.plots.overlay import benchmark_and_largest
 from postflight.plots.paper_figures import fit_height, trajectory_angle, window
@@ -25,16 +25,18 @@ from postflight.plots.style import (
     band,
     in_style,
     legend_above,
+    note,
     titled,
     with_holes,
 )
-from postflight.reconstruction import Reconstruction
+from postflight.plots.subject import FUSE, Drawable, answers_of, bet_of, flow_of, fused_of, lacking, words_of
+from postflight.runs import Run
 
 
 @in_style
 def figure_summary(
-    flight: Reconstruction,
-    answers: Deflections,
+    flown: Drawable,
+    answers: Deflections | None = None,
     truth: tuple[FloatArray, FloatArray] | None = None,
     *,
     pictures: bool = True,
@@ -43,37 +45,86 @@ def figure_summary(
 
     Parameters
     ----------
+    flown : Deflections or Run
+        With ``answers`` also Reconstruction or FlightLoads.
+    answers : Deflections, optional
+        Those that were given as ``flown``, or of the run, without.
     truth : ((n,) s, (n,) deg), optional
         Of a synthetic flight, to be given only when everything is estimated.
     pictures : bool
         Whether benchmark frame and frame of the largest deflection stand on top, where the camera answered.
+
+    Raises
+    ------
+    GateError
+        Where there is no deflection, or neither trajectory nor loads.
     """
+    answers = answers or answers_of("figure_summary", flown)
+    air = flow_of("figure_summary", flown)
     pictures = pictures and "camera" in answers.histories
     figure = Figure(figsize=(9.0, 9.0 if pictures else 6.4))
     place = figure
     if pictures:
         top, place = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.0, 1.9))))
         picture = top.subplots()
-        strip, caption = benchmark_and_largest(flight.telemetry, answers.histories["camera"])
+        telemetry = bet_of("figure_summary", flown).telemetry
+        strip, caption = benchmark_and_largest(telemetry, answers.histories["camera"])
         picture.imshow(strip)
         picture.set_title(caption, fontsize=8)
         picture.axis("off")
     upper, lower = place.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
     _methods(upper, answers, truth)
-    upper.axvline(flight.peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
-    largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
-    top_deg = 1.25 * float(max(largest, default=5.0))
-    upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(flight), ylim=(0, top_deg))
+    peak_s = float(air.time_s[np.nanargmax(air.dynamic_pressure_pa)]) if answers.bet is None else answers.bet.peak_s
+    upper.axvline(peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
+    upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(air), ylim=(0, _top_deg(answers)))
     legend_above(upper, 5, "bands: 1 sd; dotted: peak dynamic pressure")
-    trajectory_angle(lower, flight, "centerbody total angle of attack, 1 sd")
+    trajectory_angle(lower, air, "centerbody total angle of attack, 1 sd")
     lower.set(ylabel="angle of attack (deg)", xlabel=TIME)
-    fit_height(lower, flight)
+    fit_height(lower, air)
     legend_above(lower, 1)
     pressure = lower.twinx()
-    pressure.plot(flight.air.time_s, flight.air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
+    pressure.plot(air.time_s, air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
     pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
-    return titled(figure, "Deflection of the aeroshell by each method", flight.flight)
+    return titled(figure, "Deflection of the aeroshell by each method", words_of(flown))
+
+
+@in_style
+def figure_deflection(flown: DeflectionHistory | Deflections | Run) -> Figure:
+    """Angle and plane of the deflection over time, by one method or by each, with bands of one standard deviation.
+
+    Parameters
+    ----------
+    flown : DeflectionHistory, Deflections or Run
+
+    Raises
+    ------
+    GateError
+        Where there is no deflection.
+    """
+    if isinstance(flown, DeflectionHistory):
+        answers = Deflections({flown.method: flown})
+    else:
+        answers = answers_of("figure_deflection", flown)
+    figure = Figure(figsize=(9.0, 6.0))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1.0))
+    _methods(upper, answers)
+    upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", ylim=(0, _top_deg(answers)))
+    legend_above(upper, 5, "bands: 1 sd")
+    if answers.knows_peak:
+        upper.set_xlim(window(flow_of("figure_deflection", answers)))
+    for method, history in answers.continuous.items():
+        clear = np.isfinite(history.theta_rad) & ~(history.theta_sd_rad > history.theta_rad)
+        plane = np.where(clear, np.rad2deg(history.plane_lv_rad), np.nan)
+        lower.plot(history.time_s, plane, ".", ms=2, color=COLOUR.get(method, COLOUR["estimate"]))
+    lower.set(ylabel="plane (deg LV), where\ndeflection > its sd", xlabel=TIME, ylim=(0.0, 360.0))
+    return titled(figure, "Deflection of the aeroshell", words_of(answers))
+
+
+def _top_deg(answers: Deflections) -> float:
+    """Where an axis of deflections ends, deg."""
+    largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
+    return 1.25 * float(max(largest, default=5.0))
 
 
 def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray] | None = None) -> None:
@@ -87,16 +138,28 @@ def _methods(ax: Axes, answers: Deflections, truth: tuple[FloatArray, FloatArray
     for method, history in answers.continuous.items():
         t, (theta, sd) = with_holes(history.time_s, [np.rad2deg(history.theta_rad), np.rad2deg(history.theta_sd_rad)])
         mark = "" if len(history.time_s) > 400 else "."  # of many answers none is marked
-        style: dict[str, Any] = {"color": COLOUR[method], "ls": STROKE[method], "marker": mark, "ms": 3}
-        ax.plot(t, theta, label=LABEL[method], **style)
-        band(ax, t, theta, sd, COLOUR[method], alpha=WIDE_BAND)
+        colour = COLOUR.get(method, COLOUR["estimate"])
+        style: dict[str, Any] = {"color": colour, "ls": STROKE.get(method, "-"), "marker": mark, "ms": 3}
+        ax.plot(t, theta, label=LABEL.get(method, method), **style)
+        band(ax, t, theta, sd, colour, alpha=WIDE_BAND)
     if truth is not None:
         ax.plot(*truth, color=COLOUR["truth"], lw=0.8, label="truth (synthetic)")
 
 
 @in_style
-def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
-    """Fused angle and plane, the Southwell plot, and the estimate of each input the methods depend on."""
+def figure_fusion(flown: Deflections) -> Figure:
+    """Fused angle and plane, the Southwell plot, and the estimate of each input the methods depend on.
+
+    Parameters
+    ----------
+    flown : Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no fused answer. A run does not store what stands behind it.
+    """
+    fused = fused_of("figure_fusion", flown)
     figure = Figure(figsize=(11.0, 7.5))
     (angle, line), (plane, inputs) = figure.subplots(2, 2)
     history = fused.history
@@ -113,11 +176,11 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
         band(ax, t, drawn, sd_drawn, COLOUR["fused"], label="1 sd")
         ax.set(ylabel=label, xlabel=TIME, ylim=(0.0, top))
         legend_above(ax, 2)
-    if limbs is None:
+    if fused.limbs is None:
         line.set_axis_off()
         line.text(0.5, 0.5, "no Southwell line", ha="center", transform=line.transAxes)
     else:
-        _southwell(line, limbs)
+        _southwell(line, fused.limbs)
     names = list(fused.inputs)
     mean = [fused.inputs[n][0][0] for n in names]
     left = [np.sqrt(fused.inputs[n][1][0, 0]) for n in names]
@@ -125,8 +188,7 @@ def figure_fusion(fused: Fused, limbs: Limbs | None, words: str) -> Figure:
     inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
     inputs.set_yticks(range(len(names)), names, fontsize=min(8.0, 160.0 / len(names)))
     inputs.set(xlabel="estimate and 1 sd, in a priori standard deviations (grey: a priori)")
-    figure.suptitle(fill(words, 130))
-    return figure
+    return titled(figure, fill(f"{fused.agreement.remark}; {fused.limbs_remark}", 130), words_of(flown))
 
 
 def _southwell(ax: Axes, limbs: Limbs) -> None:
@@ -148,11 +210,22 @@ def _southwell(ax: Axes, limbs: Limbs) -> None:
 
 
 @in_style
-def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
+def figure_correlation(flown: Deflections) -> Figure:
     """Which directions of the inputs the measurements determine, and which inputs stay correlated.
 
     A direction of the inputs of singular value ``s`` keeps ``1 / (1 + s^2)`` of its a priori variance.
+
+    Parameters
+    ----------
+    flown : Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no fused answer. A run does not store what stands behind it.
     """
+    fused = fused_of("figure_correlation", flown)
+    singular_values = fused.agreement.singular_values
     figure = Figure(figsize=(11.0, 6.0))
     values, table = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
     better = int(np.sum(singular_values > 1.0))
@@ -173,6 +246,7 @@ def figure_correlation(fused: Fused, singular_values: FloatArray) -> Figure:
     most = f"largest: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
     table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{most}")
     figure.colorbar(image, ax=table, shrink=0.7, label="correlation coefficient")
+    note(figure, words_of(flown))
     return figure
 
 
@@ -187,8 +261,20 @@ _PANELS = {
 
 
 @in_style
-def figure_increments(increments: AeroIncrements) -> Figure:
-    """Increments of the four coefficients along Mach number, before the flight and after it, with 1 sd."""
+def figure_increments(flown: AeroIncrements | Deflections) -> Figure:
+    """Increments of the four coefficients along Mach number, before the flight and after it, with 1 sd.
+
+    Parameters
+    ----------
+    flown : AeroIncrements or Deflections
+        Of deflections without them they are estimated.
+
+    Raises
+    ------
+    GateError
+        Where there are none.
+    """
+    increments = flown if isinstance(flown, AeroIncrements) else _increments(flown)
     figure = Figure(figsize=(9.6, 6.6))
     axes = figure.subplots(2, 2, sharex=True)
     for k, (ax, (label, scale)) in enumerate(zip(axes.flat, _PANELS.items(), strict=True)):
@@ -198,8 +284,17 @@ def figure_increments(increments: AeroIncrements) -> Figure:
         ax.set_xlabel("Mach number")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, ncols=len(labels), loc="outside lower left")
-    figure.suptitle("Aerodynamic coefficients in flight against the preflight table")
-    return figure
+    return titled(figure, "Aerodynamic coefficients in flight against the preflight table", words_of(flown))
+
+
+def _increments(flown: Deflections) -> AeroIncrements:
+    """Increments that answers hold, or that are estimated of them."""
+    found = with_increments(flown) if isinstance(flown, Deflections) and flown.increments is None else flown
+    if isinstance(found, Deflections) and found.increments is not None:
+        return found.increments
+    if isinstance(found, Deflections) and found.no_increments is not None:
+        raise GateError([found.no_increments])
+    raise lacking("figure_increments", flown, "increments", FUSE, "pf.aero_increments(bet)")
 
 
 def _along_mach(ax: Axes, increments: AeroIncrements, k: int, scale: float) -> None:

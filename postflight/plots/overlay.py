@@ -22,7 +22,12 @@ from flightmodel.checks import GateError, Progress
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.film import Image, film_frames
 from flightmodel.telemetry import Telemetry
+from postflight.deflections import Deflections
 from postflight.filming import orient_on_film, with_largest
+from postflight.flight import Flight
+from postflight.plots.subject import film_of
+from postflight.reconstruction import Reconstruction
+from postflight.runs import Run
 
 
 def deflection_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]:
@@ -80,16 +85,36 @@ def write_overlay(
     path.write_bytes(cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes())
 
 
-def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: Path, progress: Progress) -> None:
+def write_overlay_film(
+    flown: Flight | Reconstruction | Run | Deflections,
+    path: str | Path,
+    history: DeflectionHistory | None = None,
+    camera: str | None = None,
+    progress: Progress | None = None,
+) -> None:
     """Write the film: the virtual view over the right half, its edge in yellow, the benchmark's in grey, the answer.
 
     A frame that was rejected is shown as it is, with the remark. The file appears when it is whole.
 
+    Parameters
+    ----------
+    flown : Deflections or Run
+        With a ``history`` also Flight or Reconstruction.
+    path : path
+        ``.webm``.
+    history : DeflectionHistory, optional
+        The camera's; that of the answers without.
+    camera : str, optional
+        Name of one of several cameras; the first without.
+    progress : callable, optional
+
     Raises
     ------
     GateError
-        Where this build of OpenCV cannot write VP9, or the disk is full.
+        Where there is no answer of the camera, this build of OpenCV cannot write VP9, or the disk is full.
     """
+    path, report = Path(path), progress or (lambda _fraction, _what: None)
+    telemetry, history = film_of("write_overlay_film", flown, history, camera)
     frames, vehicle = telemetry.frames, telemetry.required_vehicle()
     assert frames is not None
     oriented, benchmark = oriented_camera(telemetry, history)
@@ -104,7 +129,7 @@ def write_overlay_film(telemetry: Telemetry, history: DeflectionHistory, path: P
         raise GateError(f"{path}: this build of OpenCV cannot write VP9 films; leave out --film", "package-missing")
     try:
         for k, image in enumerate(frames.pictures()):
-            progress(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
+            report(k / len(frames.time_s), f"drawing frame {k + 1} of {len(frames.time_s)}")
             theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
             time = f"{frames.time_s[k]:8.2f} s   "
             if image.shape != size[::-1]:

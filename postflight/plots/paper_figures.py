@@ -19,41 +19,58 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from estimators.camera_fit import OrientedCamera
+from estimators.loads import FlightLoads
 from estimators.misalignment import aerodynamic_angle, aeroshell_acceleration, psi_from_acceleration
-from estimators.trim import StaticTrim
-from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import BoolArray, FloatArray
+from estimators.trim import static_trim
+from flightmodel.airdata import AirData, pressure_pulse
+from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.geometry import BodyMesh
-from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, titled
+from flightmodel.trajectory import interpolate_rows
+from flightmodel.vehicle import Vehicle
+from postflight.deflections import Deflections
+from postflight.flight import Flight
+from postflight.plots.overlay import deflection_at, oriented_camera
+from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, note, titled
+from postflight.plots.subject import (
+    Drawable,
+    Flow,
+    bet_of,
+    film_of,
+    flow_of,
+    history_of,
+    loads_of,
+    reconstruction_of,
+    words_of,
+)
 from postflight.reconstruction import Reconstruction
-from postflight.studies.preflight import Bounds, entry_bounds
+from postflight.runs import Run
+from postflight.studies.preflight import Bounds, bounds_of, entry_bounds
 
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
-def window(flight: Reconstruction) -> tuple[float, float]:
+def window(air: AirData | Flow) -> tuple[float, float]:
     """Times shown, s: from 80 km or so to well after the pressure pulse."""
-    pulse = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
+    pulse = air.time_s[pressure_pulse(air.dynamic_pressure_pa)]
     width = pulse[-1] - pulse[0]
     first, last = pulse[0] - 0.75 * width, pulse[-1] + 0.5 * width
-    return float(max(first, flight.air.time_s[0])), float(min(last, flight.air.time_s[-1]))
+    return float(max(first, air.time_s[0])), float(min(last, air.time_s[-1]))
 
 
-def trajectory_angle(ax: Axes, flight: Reconstruction, label: str) -> None:
+def trajectory_angle(ax: Axes, air: AirData | Flow, label: str) -> None:
     """Draw the trajectory's total angle of attack with its standard deviation."""
-    air = flight.air
     alpha, sd = np.rad2deg(air.alpha_total_wind_rad), np.rad2deg(air.alpha_total_wind_sd_rad)
     ax.plot(air.time_s, alpha, color=COLOUR["estimate"], lw=1.4, label=label)
     band(ax, air.time_s, alpha, sd, COLOUR["estimate"])
 
 
 def fit_height(
-    ax: Axes, flight: Reconstruction, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
+    ax: Axes, air: AirData | Flow, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
 ) -> None:
     """Let an axis of angles, deg, end above those lines, by their label's start, that the window shows."""
-    first, last = window(flight)
+    first, last = window(air)
     lines = [
         np.asarray(line.get_xydata(), dtype=np.float64) for line in ax.lines if str(line.get_label()).startswith(of)
     ]
@@ -63,35 +80,93 @@ def fit_height(
 
 
 @in_style
-def figure_1_3(flight: Reconstruction, bounds: Bounds | None = None, flights: int = 100) -> Figure:
+def figure_1_3(flown: Drawable, bounds: Bounds | None = None, flights: int = 100) -> Figure:
     """Total angle of attack and normal acceleration against a rigid vehicle's Monte Carlo bounds (Figure 1.3).
 
-    Without ``bounds`` the rigid vehicle is simulated ``flights`` times from this flight's own state.
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+        With ``bounds`` also FlightLoads.
+    bounds : Bounds, optional
+        Those of a run are its own. Otherwise the rigid vehicle is simulated ``flights`` times from the flight's state.
+    flights : int
+
+    Raises
+    ------
+    GateError
+        Where there are no loads, or no trajectory to simulate from.
     """
-    bounds = bounds or entry_bounds(flight, None, flights)
+    if bounds is None:
+        bounds = _bounds(flown, flights)
     figure = Figure(figsize=(7.2, 7.0))
     upper, lower = figure.subplots(2, 1, sharex=True)
-    air, pulse = flight.air, flight.required_loads()
+    air, pulse = flow_of("figure_1_3", flown), loads_of("figure_1_3", flown)
     for ax, (bound, nominal) in zip((upper, lower), bounds.by_quantity.values(), strict=True):
         share = f"2.3 to 97.7 % of {bounds.flights} rigid flights"
         ax.fill_between(bounds.time_s, bound[0], bound[2], color=COLOUR["prior_band"], lw=0, label=share)
         ax.plot(bounds.time_s, bound[1], color=COLOUR["prior"], lw=1, label="rigid, 50 %")
         ax.plot(bounds.time_s, nominal, color=COLOUR["limit"], lw=1, ls=":", label="rigid, nominal")
-    trajectory_angle(upper, flight, "trajectory, wind-relative, 1 sd")
-    ground = np.rad2deg(air.alpha_total_ground_rad)
-    upper.plot(air.time_s, ground, color=COLOUR["ground"], lw=1, ls="--", label="trajectory, no wind")
+    trajectory_angle(upper, air, "trajectory, wind-relative, 1 sd")
+    if isinstance(air, AirData):
+        ground = np.rad2deg(air.alpha_total_ground_rad)
+        upper.plot(air.time_s, ground, color=COLOUR["ground"], lw=1, ls="--", label="trajectory, no wind")
     normal = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
     lower.plot(pulse.time_s, normal, color=COLOUR["estimate"], lw=1.4, label="measured, at the c.g.")
-    upper.set(ylabel="total angle of attack (deg)", xlim=window(flight))
-    fit_height(upper, flight, of=("trajectory",), room=1.5)  # a rigid vehicle may tumble: its band ends with the axis
+    upper.set(ylabel="total angle of attack (deg)", xlim=window(air))
+    fit_height(upper, air, of=("trajectory",), room=1.5)  # a rigid vehicle may tumble: its band ends with the axis
     lower.set(ylabel="normal acceleration (g)", ylim=(0, None), xlabel=TIME)
     legend_above(upper, 3)
     legend_above(lower, 4)
-    return titled(figure, "Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)", flight.flight)
+    title = "Flight against a rigid vehicle (in the manner of AIAA 2011-2571, Figure 1.3)"
+    return titled(figure, title, words_of(flown))
+
+
+def _bounds(flown: Drawable, flights: int) -> Bounds:
+    """Bounds of the rigid vehicle: those that a run stored, else simulated."""
+    bet = bet_of("figure_1_3 without bounds", flown)
+    if isinstance(bet, Run) and "rigid_bounds" in bet.tables:
+        return bounds_of(bet.tables["rigid_bounds"])
+    return entry_bounds(reconstruction_of("figure_1_3", flown, "rigid_bounds.csv"), None, flights)
 
 
 @in_style
 def figure_2_3(
+    flown: Flight | Reconstruction | Run | Deflections,
+    history: DeflectionHistory | None = None,
+    camera: str | None = None,
+) -> Figure:
+    """Benchmark frame and frame of the largest deflection, the virtual camera over the right part of each (Figure 2.3).
+
+    The dashed yellow line is the smallest row of the virtual camera's edge, the solid one that of the edge found near
+    it in the frame (beyond may be the Earth's limb). Where they coincide the deflection fits.
+
+    Parameters
+    ----------
+    flown : Deflections or Run
+        With a ``history`` also Flight or Reconstruction.
+    history : DeflectionHistory, optional
+        The camera's; that of the answers without.
+    camera : str, optional
+        Name of one of several cameras; the first without.
+
+    Raises
+    ------
+    GateError
+        Where there is no answer of the camera, or no film.
+    """
+    telemetry, own = film_of("figure_2_3", flown, history, camera)
+    oriented, benchmark = oriented_camera(telemetry, own)
+    frames, pick = telemetry.frames, [benchmark, own.largest()]
+    assert frames is not None
+    times = [float(t) for t in frames.time_s[pick]]
+    theta, plane = zip(*(deflection_at(own, t) for t in times), strict=True)
+    meshes = telemetry.required_vehicle().meshes
+    figure = frames_with_camera(oriented, [frames.picture(k) for k in pick], times, theta, plane, meshes)
+    note(figure, words_of(flown))
+    return figure
+
+
+def frames_with_camera(
     oriented: OrientedCamera,
     frames: Sequence[NDArray[np.uint8]],
     times_s: Sequence[float],
@@ -99,10 +174,7 @@ def figure_2_3(
     plane_lv_rad: Sequence[float],
     meshes: Mapping[str, BodyMesh] | None = None,
 ) -> Figure:
-    """Frames side by side, the virtual camera over the right part of each (Figure 2.3).
-
-    The dashed yellow line is the smallest row of the virtual camera's edge, the solid one that of the edge found near
-    it in the frame (beyond may be the Earth's limb); where they coincide the hypothesised deflection fits.
+    """Frames side by side, the virtual camera over the right part of each, as `figure_2_3` has two.
 
     Parameters
     ----------
@@ -138,62 +210,113 @@ def figure_2_3(
 
 
 @in_style
-def figure_2_5(flight: Reconstruction) -> Figure:
-    """Angle of attack by the trajectory and inferred from the uncorrected accelerometers (Figure 2.5)."""
+def figure_2_5(flown: Drawable) -> Figure:
+    """Angle of attack by the trajectory and inferred from the uncorrected accelerometers (Figure 2.5).
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run, FlightLoads or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there are no loads.
+    """
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
-    trajectory_angle(ax, flight, "centerbody by the trajectory, 1 sd")
-    pulse = flight.required_loads()
+    pulse, air = loads_of("figure_2_5", flown), flow_of("figure_2_5", flown)
+    trajectory_angle(ax, air, "centerbody by the trajectory, 1 sd")
     use = pulse.informative
-    inferred = aerodynamic_angle(flight.telemetry.required_vehicle().aero, pulse.mach, pulse.specific_force_body_mps2)
+    inferred = aerodynamic_angle(pulse.vehicle.aero, pulse.mach, pulse.specific_force_body_mps2)
     _look_up(ax, pulse.time_s, use, inferred, COLOUR["measured"], "C_N/C_A look-up, accelerometers uncorrected")
     beyond = use & ~np.isfinite(inferred)
     if beyond.any():
         edge = np.full(beyond.sum(), _LOOK_UP_END_DEG - 1.0)
         label = f"beyond the look-up ({_LOOK_UP_END_DEG:.0f} deg)"
         ax.plot(pulse.time_s[beyond], edge, "^", ms=3, color=COLOUR["measured"], label=label)
-    return _angles(figure, ax, flight, "Angle of attack: trajectory against uncorrected accelerometers", "2.5")
+    _angles(ax, air)
+    title = "Angle of attack: trajectory against uncorrected accelerometers (AIAA 2011-2571, Figure 2.5)"
+    return titled(figure, title, words_of(flown))
 
 
 @in_style
-def figure_2_7(flight: Reconstruction, history: DeflectionHistory) -> Figure:
-    """The same with the accelerometers rotated by the estimated deflection, and the trajectory less it (Figure 2.7)."""
+def figure_2_7(flown: Drawable, history: DeflectionHistory | None = None) -> Figure:
+    """The same with the accelerometers rotated by the estimated deflection, and the trajectory less it (Figure 2.7).
+
+    Parameters
+    ----------
+    flown : Deflections or Run
+        With a ``history`` also Reconstruction or FlightLoads.
+    history : DeflectionHistory, optional
+        Of any method, interpolated to the times of the loads; that of the misalignment without.
+
+    Raises
+    ------
+    GateError
+        Where there are no loads, or no deflection.
+    """
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
-    pulse, aero = flight.required_loads(), flight.telemetry.required_vehicle().aero
-    use, force = pulse.informative, pulse.specific_force_body_mps2
+    pulse, air = loads_of("figure_2_7", flown), flow_of("figure_2_7", flown)
+    use, force, aero = pulse.informative, pulse.specific_force_body_mps2, pulse.vehicle.aero
+    theta_yz = _at_loads(history or history_of("figure_2_7", flown, "misalignment"), pulse.time_s)
+    size = np.linalg.norm(theta_yz, axis=1)
     raw = aerodynamic_angle(aero, pulse.mach, force)
-    rotated = aeroshell_acceleration(force, np.nan_to_num(history.theta_rad), psi_from_acceleration(force))
+    rotated = aeroshell_acceleration(force, np.nan_to_num(size), psi_from_acceleration(force))
     corrected = aerodynamic_angle(aero, pulse.mach, rotated)
-    biased = np.linalg.norm(pulse.flow_yz_rad - history.theta_yz_rad, axis=1)
+    biased = np.linalg.norm(pulse.flow_yz_rad - theta_yz, axis=1)
     _look_up(ax, pulse.time_s, use, raw, COLOUR["measured"], "C_N/C_A look-up, accelerometers uncorrected")
     label = "C_N/C_A look-up, rotated by the deflection in the plane of a_N (eq. [4])"
-    _look_up(ax, pulse.time_s, use, corrected, COLOUR["corrected"], label)
+    _look_up(ax, pulse.time_s, use & np.isfinite(size), corrected, COLOUR["corrected"], label)
     label = "trajectory less the deflection: aeroshell"
     ax.plot(pulse.time_s, np.rad2deg(biased), color=COLOUR["estimate"], lw=1.4, ls="--", label=label)
-    return _angles(figure, ax, flight, "Angle of attack of the aeroshell, both ways", "2.7")
+    _angles(ax, air)
+    return titled(figure, "Angle of attack of the aeroshell, both ways (AIAA 2011-2571, Figure 2.7)", words_of(flown))
+
+
+def _at_loads(history: DeflectionHistory, time_s: FloatArray) -> FloatArray:
+    """Lateral deflection (m, 2), rad, at other times; NaN outside the answers."""
+    known = np.isfinite(history.theta_rad)
+    answered = history.time_s[known]
+    out = interpolate_rows(time_s, answered, history.theta_yz_rad[known])
+    out[(time_s < answered[0]) | (time_s > answered[-1])] = np.nan
+    return out
 
 
 def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray, colour: str, label: str) -> None:
     ax.plot(time_s, np.where(use, np.rad2deg(angle_rad), np.nan), color=colour, label=label)
 
 
-def _angles(figure: Figure, ax: Axes, flight: Reconstruction, title: str, number: str) -> Figure:
-    ax.set(xlim=window(flight), ylabel="total angle of attack (deg)", xlabel=TIME)
-    fit_height(ax, flight, most=_LOOK_UP_END_DEG)
+def _angles(ax: Axes, air: AirData | Flow) -> None:
+    ax.set(xlim=window(air), ylabel="total angle of attack (deg)", xlabel=TIME)
+    fit_height(ax, air, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)
-    return titled(figure, f"{title} (AIAA 2011-2571, Figure {number})", flight.flight)
 
 
 @in_style
-def figure_2_9(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: float, title: str) -> Figure:
-    """Trim angle over joint stiffness for several c.g. offsets, with the divergence limit (Figure 2.9)."""
+def figure_2_9(flown: Drawable) -> Figure:
+    """Trim angle over joint stiffness at peak pressure for several c.g. offsets, with divergence (Figure 2.9).
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run, FlightLoads or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there are no loads, or the vehicle has no static trim.
+    """
     figure = Figure(figsize=(7.2, 4.2))
     ax = figure.subplots()
+    pulse = loads_of("figure_2_9", flown)
+    vehicle, mach, pressure = _at_peak(pulse)
+    static, joint_nmprad = static_trim(vehicle, mach, pressure), vehicle.joint.bending_stiffness_nmprad
     marks = (static.critical_stiffness_nmprad, joint_nmprad, static.stiffness_for_growth(0.25))
     # a joint 20 times as stiff as wanted is shown; a locked one lies beyond the axis
     ends = 0.5 * min(marks), 2.0 * max(marks[2], min(joint_nmprad, 20.0 * marks[2]))
     stiffness = np.geomspace(*ends, 600)
+    own = float(np.linalg.norm(vehicle.cg_m[1:]))
+    offsets_m = sorted({round(own, 5), 0.01, 0.0254})  # its own, and those of the paper's figure
     for offset, colour in zip(offsets_m, MANY[1:], strict=False):
         angle = np.rad2deg(static.trim_angle(stiffness, offset))
         ax.semilogx(stiffness, angle, color=colour, label=f"{100 * offset:.2f} cm")
@@ -203,5 +326,20 @@ def figure_2_9(static: StaticTrim, offsets_m: Sequence[float], joint_nmprad: flo
     ax.set(xlabel="joint stiffness (N m/rad)", ylabel="trim angle of attack of the aeroshell (deg)")
     ax.set(xlim=ends, ylim=(0.0, 20.0))
     ax.legend(title="initial c.g. offset", loc="upper right", frameon=True, framealpha=0.9)
-    figure.suptitle(title)
-    return figure
+    title = f"Static trim at {pressure:.0f} Pa, Mach {mach:.1f} (AIAA 2011-2571, Figure 2.9)"
+    return titled(figure, title, words_of(flown))
+
+
+def has_static_trim(loads: FlightLoads) -> bool:
+    """Whether the vehicle has a static trim at peak pressure, so that `figure_2_9` can be drawn."""
+    try:
+        static_trim(*_at_peak(loads))
+    except GateError:
+        return False
+    return True
+
+
+def _at_peak(loads: FlightLoads) -> tuple[Vehicle, float, float]:
+    """Vehicle, Mach number and dynamic pressure, Pa, at the peak of dynamic pressure."""
+    k = int(np.argmax(loads.dynamic_pressure_pa))
+    return loads.vehicle, float(loads.mach[k]), float(loads.dynamic_pressure_pa[k])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -10,20 +12,65 @@ from matplotlib.ticker import MaxNLocator
 from flightmodel.checks import FloatArray
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
-from flightmodel.telemetry import Telemetry
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, ellipses, in_style, legend_above, limits, titled
+from postflight.plots.subject import lacking, words_of
 from postflight.reconciliation.fit import JointFit
 from postflight.reconciliation.modes import ModalStiffness
-from postflight.reconciliation.posterior import Posterior, linear_quantities, quantities, stiffness_and_offset
+from postflight.reconciliation.posterior import (
+    Posterior,
+    linear_quantities,
+    quantities,
+    sample,
+    stiffness_and_offset,
+)
+from postflight.reconstruction import Reconstruction
 
 _FOUND = COLOUR["estimate"]
 
 
+class Reconciled(Protocol):
+    """What `reconcile` returns: `Reconciliation`."""
+
+    @property
+    def bet(self) -> Reconstruction:
+        """What was reconciled."""
+
+    @property
+    def fit(self) -> JointFit:
+        """Parameters, covariance and residuals."""
+
+    @property
+    def deflection(self) -> DeflectionHistory:
+        """Deflection of the simulated flight."""
+
+    def modal_stiffness(self) -> ModalStiffness:
+        """Bending stiffness by the joint's frequency."""
+
+
+def _fit_of(figure: str, given: Reconciled) -> JointFit:
+    """Fit of a reconciliation; `GateError` for anything else."""
+    if not isinstance(getattr(given, "fit", None), JointFit):
+        raise lacking(figure, given, "fitted joint", "pf.reconcile(bet)")
+    return given.fit
+
+
 @in_style
-def figure_reconciled(
-    found: JointFit, telemetry: Telemetry, history: DeflectionHistory, fused: DeflectionHistory | None
-) -> Figure:
-    """Rate and lateral force, measured and simulated; deflection; stiffness against offset."""
+def figure_reconciled(reconciliation: Reconciled, fused: DeflectionHistory | None = None) -> Figure:
+    """Rate and lateral force, measured and simulated; deflection; stiffness against offset.
+
+    Parameters
+    ----------
+    reconciliation : Reconciliation
+    fused : DeflectionHistory, optional
+        To be drawn beside the deflection with the estimated joint.
+
+    Raises
+    ------
+    GateError
+        For anything but a reconciliation.
+    """
+    found = _fit_of("figure_reconciled", reconciliation)
+    history = reconciliation.deflection
     figure = Figure(figsize=(10.0, 9.0))
     axes = figure.subplots(3, 2)
     seen, read = found.problem.measured, found.problem.predict(found.parameters)
@@ -40,7 +87,7 @@ def figure_reconciled(
     _ridge(axes[2, 1], found)
     for ax in axes.ravel()[:5]:
         ax.set_xlabel(TIME)
-    return titled(figure, "Joint reconciled with the flight", telemetry)
+    return titled(figure, "Joint reconciled with the flight", words_of(reconciliation.bet))
 
 
 def _pair(ax: Axes, t: FloatArray, measured: FloatArray, flown: FloatArray, label: str) -> None:
@@ -81,8 +128,22 @@ def _ridge(ax: Axes, found: JointFit) -> None:
 
 
 @in_style
-def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
-    """Every pair of quantities: samples, and the ellipses of 1 and 2 sd of the linear problem."""
+def figure_posterior(reconciliation: Reconciled, posterior: Posterior | None = None) -> Figure:
+    """Every pair of quantities: samples, and the ellipses of 1 and 2 sd of the linear problem.
+
+    Parameters
+    ----------
+    reconciliation : Reconciliation
+    posterior : Posterior, optional
+        Its samples; emcee draws them where none are given.
+
+    Raises
+    ------
+    ConfigError
+        Where the sampler (emcee) is not installed.
+    """
+    fit = _fit_of("figure_posterior", reconciliation)
+    posterior = sample(fit) if posterior is None else posterior
     table = quantities(posterior.fit.problem.vehicle_parameters, posterior.samples)
     best, covariance = linear_quantities(posterior)
     n = len(best)
@@ -104,7 +165,8 @@ def figure_posterior(posterior: Posterior, telemetry: Telemetry) -> Figure:
             ax.set_xlabel(table.columns[column], fontsize=8)
         if column == 0 and row > 0:
             ax.set_ylabel(table.columns[row], fontsize=8)
-    return titled(figure, "Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)", telemetry)
+    title = "Posterior of the joint: samples, and ellipses of the linear problem (1 and 2 sd)"
+    return titled(figure, title, words_of(reconciliation.bet))
 
 
 def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
@@ -115,8 +177,22 @@ def _histogram(ax: Axes, values: FloatArray, best: float, sd: float) -> None:
 
 
 @in_style
-def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
-    """Spectra through the pulse with the linear model's modes over them; power along the track of every stiffness."""
+def figure_modes(reconciliation: Reconciled, modal: ModalStiffness | None = None) -> Figure:
+    """Spectra through the pulse with the linear model's modes over them; power along the track of every stiffness.
+
+    Parameters
+    ----------
+    reconciliation : Reconciliation
+    modal : ModalStiffness, optional
+        Of `Reconciliation.modal_stiffness`.
+
+    Raises
+    ------
+    GateError
+        Where the joint's mode is not detected.
+    """
+    _fit_of("figure_modes", reconciliation)
+    found = reconciliation.modal_stiffness() if modal is None else modal
     figure = Figure(figsize=(9.0, 4.8))
     left, right = figure.subplots(1, 2, width_ratios=[2.0, 1.0])
     left.grid(visible=False)
@@ -137,4 +213,4 @@ def figure_modes(found: ModalStiffness, telemetry: Telemetry) -> Figure:
     right.axvspan(low, high, color=_FOUND, alpha=BAND, lw=0, label="1 sd")
     right.set(xlabel="bending stiffness (N m/rad)", ylabel="power along the joint's track")
     right.legend()
-    return titled(figure, "Modes of the lateral motion and the linear model", telemetry)
+    return titled(figure, "Modes of the lateral motion and the linear model", words_of(reconciliation.bet))

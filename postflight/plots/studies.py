@@ -6,16 +6,30 @@ made flexible.
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
-import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
+from flightmodel.checks import GateError, check_type
+from flightmodel.vehicle import Vehicle
+from postflight.montecarlo.bands import Merged
 from postflight.plots.style import COLOUR, MANY, STROKES, TIME, in_style, percentiles, titled
-from postflight.studies.joints import JointStudy
-from postflight.studies.preflight import Bounds
+from postflight.plots.subject import lacking, reconstruction_of, words_of
+from postflight.reconstruction import Reconstruction
+from postflight.studies.joints import STUDIES, JointStudy, table_3_1
+from postflight.studies.preflight import Bounds, pulse_columns, shares
 from postflight.studies.shell_test import ShellTest
+from synthetic_flight.scenarios import Scenario
 
+_ALPHA, _NORMAL = "centerbody total angle of attack (deg)", "centerbody normal acceleration (g)"
+# figure of the paper: its study, title, quantity and label
+JOINT_FIGURES = {
+    "3.1": ("damping", "Damping of the joint at 2.5 Hz, % of critical", "alpha_total_deg", _ALPHA),
+    "3.2": ("stiffness", "Stiffness of the joint at 0.5 % of critical", "alpha_total_deg", _ALPHA),
+    "3.3": ("stiffness", "Stiffness of the joint at 0.5 % of critical", "normal_g", _NORMAL),
+}
 _HIGHEST = {"alpha_total_deg": 25.0, "normal_g": 2.5}  # shown of a joint study; a tumble goes beyond
 _LABEL = {
     "alpha_total_deg": "centerbody total\nangle of attack (deg)",
@@ -31,8 +45,25 @@ _LABEL = {
 
 
 @in_style
-def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
-    """Every history with its 2.3, 50 and 97.7 percentiles."""
+def figure_bands(merged: Merged, words: str = "SYNTHETIC flights") -> Figure:
+    """Every history of a Monte Carlo study with its 2.3, 50 and 97.7 percentiles.
+
+    Parameters
+    ----------
+    merged : Merged
+        Of `monte_carlo`, whose dispersions file keeps histories.
+    words : str
+        For the corner.
+
+    Raises
+    ------
+    GateError
+        Where the study kept no histories.
+    """
+    check_type("figure_bands", merged, Merged, "pf.monte_carlo(dispersions, folder)")
+    bands = merged.bands
+    if not len(bands):
+        raise lacking("figure_bands", merged, "history", "a study whose [outputs] names histories")
     names = list(dict.fromkeys(bands["history"]))
     figure = Figure(figsize=(7.2, 2.2 * len(names) + 0.8))
     axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
@@ -43,12 +74,21 @@ def figure_bands(bands: pd.DataFrame, title: str, synthetic: str) -> Figure:
         ax.margins(x=0)
     axes[0].legend()
     axes[-1].set_xlabel(TIME)
-    return titled(figure, title, synthetic)
+    title = f"{merged.summary['flights']} dispersed flights: 2.3, 50 and 97.7 % of them"
+    return titled(figure, title, words)
 
 
 @in_style
-def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
-    """Stiffness and damping against frequency and damping ratio: the paper's as points, the equations as lines."""
+def figure_table_3_1(vehicle: Vehicle) -> Figure:
+    """Stiffness and damping against frequency and damping ratio: the paper's as points, the equations as lines.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+        Of `read_vehicle`; its own inertias are drawn beside the paper's.
+    """
+    check_type("figure_table_3_1", vehicle, Vehicle, "pf.read_vehicle(file)")
+    table = table_3_1(vehicle)
     figure = Figure(figsize=(7.2, 3.6))
     left, right = figure.subplots(1, 2)
     springs, dampers = table[table["quantity"] == "K"], table[table["study"] == "damping"]
@@ -67,12 +107,35 @@ def figure_table_3_1(table: pd.DataFrame, synthetic: str) -> Figure:
         axis.set_major_formatter(ScalarFormatter())
         axis.set_minor_formatter("")
     left.legend(fontsize=7)
-    return titled(figure, "Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)", synthetic)
+    title = "Stiffness and damping against frequency (AIAA 2011-2571, Table 3.1)"
+    return titled(figure, title, f"vehicle: {vehicle.name}")
 
 
 @in_style
-def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synthetic: str) -> Figure:
-    """One quantity of every flight of a study over time, up to a tumble; the legend names those beyond the axis."""
+def figure_joints(scenario: Scenario, number: str = "3.1", study: JointStudy | None = None) -> Figure:
+    """Angle of attack or normal acceleration of every joint of a study over time (Figures 3.1 to 3.3).
+
+    A flight is shown up to a tumble; the legend names those that go beyond the axis.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Of `read_scenario`.
+    number : str
+        Figure of the paper: ``"3.1"``, ``"3.2"`` or ``"3.3"``.
+    study : JointStudy, optional
+        The study's flights; they are flown without.
+
+    Raises
+    ------
+    GateError
+        For another figure.
+    """
+    check_type("figure_joints", scenario, Scenario, "pf.read_scenario(file)")
+    if number not in JOINT_FIGURES:
+        raise GateError(f"figure_joints: figure {number}; known are {', '.join(JOINT_FIGURES)}", "name-unknown")
+    name, title, quantity, label = JOINT_FIGURES[number]
+    study = STUDIES[name](scenario, 0) if study is None else study
     figure = Figure(figsize=(7.2, 4.4))
     ax = figure.subplots()
     largest = 0.0
@@ -90,24 +153,50 @@ def figure_joints(study: JointStudy, quantity: str, label: str, title: str, synt
     ax.set(xlabel=f"{TIME}; dotted: peak dynamic pressure", ylabel=label, ylim=(0.0, min(highest, 1.15 * largest)))
     ax.set_xlim(study.flights[0].time_s[0], study.flights[0].time_s[-1])
     ax.legend(title=f"beyond the axis: {', '.join(beyond)}" if beyond else None)
-    return titled(figure, title, synthetic)
+    words = f"SYNTHETIC flights of {scenario.spec.name}"
+    return titled(figure, f"{title} (AIAA 2011-2571, Figure {number})", words)
+
+
+class WithBounds(Protocol):
+    """What has bands of dispersed entries with the joint locked, and flexible: a `Reconciliation`."""
+
+    bet: Reconstruction
+
+    def bounds(self) -> tuple[Bounds, Bounds]:
+        """Fly both."""
+        ...
 
 
 @in_style
 def figure_preflight(
-    rigid: Bounds, flexible: Bounds, flight: pd.DataFrame, window: tuple[float, float], words: str, synthetic: str
+    flown: Reconstruction | WithBounds, rigid: Bounds | None = None, flexible: Bounds | None = None
 ) -> Figure:
     """Figure 1.3 twice: the flight against a rigid vehicle's bounds, and against those with the flexible joint.
 
     Parameters
     ----------
-    flight : DataFrame
-        Columns ``time_s, alpha_total_deg, normal_g``.
-    window : (float, float)
-        Times shown, s.
-    words : str
-        Which share of the pulse is inside, under the title.
+    flown : Reconciliation
+        With ``rigid`` and ``flexible`` also Reconstruction.
+    rigid, flexible : Bounds, optional
+        Of `Reconciliation.bounds`; they are flown without.
+
+    Raises
+    ------
+    GateError
+        Where there are no bounds to draw, or no loads.
     """
+    if rigid is None or flexible is None:
+        if not hasattr(flown, "bounds"):
+            raise lacking("figure_preflight", flown, "bounds", "pf.reconcile(bet)", "rigid and flexible bounds")
+        rigid, flexible = flown.bounds()
+    bet = reconstruction_of("figure_preflight", getattr(flown, "bet", flown), "bounds")
+    flight, first_s, last_s = pulse_columns(bet), *bet.pulse_s
+    window = first_s - 10.0, last_s + 5.0
+    table = shares(bet, rigid, flexible)
+    inside = "; ".join(
+        f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
+        for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
+    )
     figure = Figure(figsize=(9.0, 6.4))
     axes = figure.subplots(2, 2, sharex=True, sharey="row")
     shown = flight["time_s"].between(*window)
@@ -124,7 +213,8 @@ def figure_preflight(
         ax.set(ylabel=label, ylim=(0.0, 2.2 * float(flight.loc[shown, quantity].max())))
     axes[0, 0].set_xlim(*window)
     axes[0, 0].legend()
-    return titled(figure, f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\n{words}", synthetic)
+    title = f"Flight against bounds of its own entry (AIAA 2011-2571, Figure 1.3)\ninside, of the pulse: {inside}"
+    return titled(figure, title, words_of(bet))
 
 
 @in_style

@@ -17,22 +17,20 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, GateError
 from flightmodel.deflection import HOLE_FACTOR
-from flightmodel.telemetry import Telemetry
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from postflight.flight import Flight
 
 _BLACK, _BLUE, _VERMILION, _GREEN = "#000000", "#0072B2", "#D55E00", "#009E73"
 _PURPLE, _ORANGE, _SKY, _YELLOW = "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"
@@ -95,6 +93,8 @@ _PARAMETERS: dict[Any, Any] = {
     "axes.spines.top": False, "axes.spines.right": False, "xtick.labelsize": 8.5, "ytick.labelsize": 8.5,
     "legend.frameon": False, "legend.fontsize": 8, "legend.title_fontsize": 8, "legend.loc": "upper left",
 }  # fmt: skip
+# formats of figures, and what matplotlib would write into each that differs from day to day or place to place
+FORMATS = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -195,37 +195,47 @@ def note(figure: Figure, words: str) -> None:
     figure.supxlabel(words, x=0.995, ha="right", fontsize=7, color=COLOUR["note"], parse_math=False)
 
 
-def stamp(figure: Figure, telemetry: Telemetry, changes: tuple[str, ...] = ()) -> None:
-    """Name the flight in the corner, whether it is synthetic, and what a what-if assumes."""
+def flight_words(name: str, synthetic: bool, changes: tuple[str, ...] = ()) -> str:
+    """Words for the corner: the flight, whether it is synthetic, and what a what-if assumes."""
     assumed = f"; what-if: {'; '.join(changes)}" if changes else ""
-    note(figure, f"{telemetry.name}: {'SYNTHETIC flight' if telemetry.synthetic else 'flight'}{assumed}")
+    return f"{name}: {'SYNTHETIC flight' if synthetic else 'flight'}{assumed}"
 
 
-def titled(figure: Figure, title: str, flown: str | Telemetry | Flight) -> Figure:
-    """Figure with its title, and in its corner the flight (as `stamp`), or the words that say what was flown."""
+def titled(figure: Figure, title: str, words: str) -> Figure:
+    """Figure with its title, and in its corner the words that say what was flown."""
     figure.suptitle(title)
-    if isinstance(flown, str):
-        note(figure, flown)
-    elif isinstance(flown, Telemetry):
-        stamp(figure, flown)
-    else:
-        stamp(figure, flown.telemetry, flown.changes)
+    note(figure, words)
     return figure
 
 
-def save(figure: Figure, path: Path | IO[bytes]) -> None:
-    """Write a PNG, to a file or a buffer, whose bytes depend on the picture alone.
+def save(figure: Figure, path: str | Path | IO[bytes]) -> None:
+    """Write a figure as PNG, PDF or SVG; the bytes depend on the picture alone.
 
-    As `savefig` does, which draws every figure once more in vain to lay it out.
+    Parameters
+    ----------
+    figure : Figure
+    path : path or binary file
+        Its ending says the format; a binary file, such as a `io.BytesIO`, becomes a PNG.
+
+    Raises
+    ------
+    GateError
+        For another ending.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    import matplotlib
 
+    form = Path(path).suffix.lower().removeprefix(".") if isinstance(path, str | Path) else "png"
+    if form not in FORMATS:
+        raise GateError(f"{path}: a figure is saved as {', '.join(FORMATS)}", "option-format")
     figure.set_dpi(110)
-    canvas, layout = FigureCanvasAgg(figure), figure.get_layout_engine()
+    # `savefig` draws a figure with a layout once more in vain to lay it out
+    layout = figure.get_layout_engine()
     if layout is not None:
         layout.execute(figure)
         figure.set_layout_engine("none")
-    canvas.print_png(path, metadata={"Software": None})
+    # no date, and in SVG no random names
+    with matplotlib.rc_context({"svg.hashsalt": "postflight"}):
+        figure.savefig(path, format=form, dpi="figure", metadata={FORMATS[form]: None})
 
 
 class FigureWarning(RuntimeWarning):
@@ -250,3 +260,16 @@ def draw(path: Path, figure: Callable[_P, Figure], *args: _P.args, **named: _P.k
         path.unlink(missing_ok=True)
         words = f"{path.name} was not drawn ({type(fault).__name__}: {fault}); tables and report are whole"
         warnings.warn(FigureWarning(words), stacklevel=2)
+
+
+@dataclass(frozen=True)
+class FigureFolder:
+    """Folder of figures, and the formats in which each of them is drawn there."""
+
+    path: Path
+    formats: tuple[str, ...] = ("png",)
+
+    def draw(self, name: str, figure: Callable[_P, Figure], *args: _P.args, **named: _P.kwargs) -> None:
+        """Draw a figure in every format, each as `draw` does."""
+        for form in self.formats:
+            draw(self.path / f"{name}.{form}", figure, *args, **named)

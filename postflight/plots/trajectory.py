@@ -9,20 +9,32 @@ from matplotlib.figure import Figure
 
 from flightmodel.atmosphere import profile_from_sounding
 from flightmodel.checks import FloatArray
-from flightmodel.trajectory import difference, resample
+from flightmodel.trajectory import difference
 from postflight.plots.style import AXES, BAND, COLOUR, TIME, band, drawn_unit, in_style, legend_above, limits, titled
-from postflight.reconstruction import AttitudeCheck, Reconstruction
-from postflight.sensitivity import GROUPS, largest_of_groups
-from recon.atmosphere import ReconstructedAir
+from postflight.plots.subject import Drawable, bet_of, lacking, reconstruction_of, words_of
+from postflight.reconstruction import attitude_table
+from postflight.runs import Run
+from postflight.sensitivity import GROUPS, largest_of_groups, sensitivity
 from recon.measurements import component_unit
 
 
 @in_style
-def figure_flown(flight: Reconstruction) -> Figure:
-    """Altitude, speed and their standard deviations: the picture of a flight without a vehicle file."""
+def figure_flown(flown: Drawable) -> Figure:
+    """Altitude, speed and their standard deviations: the picture of a flight without a vehicle file.
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no trajectory.
+    """
     figure = Figure(figsize=(7.2, 7.0))
     high, fast, sure = figure.subplots(3, 1, sharex=True)
-    bet, air = flight.solution.smoothed, flight.air
+    flight = bet_of("figure_flown", flown)
+    bet, air = flight.trajectory, flight.air
     high.plot(air.time_s, air.altitude_m / 1e3, color=COLOUR["estimate"])
     high.set_ylabel("altitude (km)")
     fast.plot(air.time_s, np.linalg.norm(bet.velocity_ecef_mps, axis=1), color=COLOUR["estimate"])
@@ -31,24 +43,36 @@ def figure_flown(flight: Reconstruction) -> Figure:
         sure.semilogy(air.time_s, np.linalg.norm(bet.sd()[:, first : first + 3], axis=1), color=colour, label=label)
     sure.set(ylabel="standard deviation", xlabel=TIME)
     sure.legend(loc="best")
-    found = [f for f in flight.solution.findings if f.source == "motion"]
+    found = [f for f in flight.findings if f.source == "motion"]
     for ax in (high, fast, sure):
         for f in found:
             ax.axvspan(f.start_s, f.end_s, color=COLOUR["flagged"], alpha=0.3, lw=0)
-    return titled(
-        figure, "Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else ""), flight.flight
-    )
+    title = "Reconstructed flight" + ("; shaded: unmodelled acceleration" if found else "")
+    return titled(figure, title, words_of(flown))
 
 
 @in_style
-def figure_residuals(flight: Reconstruction) -> Figure:
-    """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked."""
-    table = flight.solution.residuals
+def figure_residuals(flown: Drawable) -> Figure:
+    """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked.
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no trajectory, or no measurement was tried.
+    """
+    flight = bet_of("figure_residuals", flown)
+    table = flight.tables["residuals"] if isinstance(flight, Run) else flight.solution.residuals
+    if not table["used"].any():
+        raise lacking("figure_residuals", flight, "residual", "a flight with a tracker")
     pairs = list(table[table["used"]].groupby(["source", "component"], sort=False))
     figure = Figure(figsize=(7.2, 1.5 * len(pairs) + 0.8))
     axes = figure.subplots(len(pairs), 1, sharex=True, squeeze=False)[:, 0]
     for ax, ((source, component), rows) in zip(axes, pairs, strict=True):
-        scale, unit = drawn_unit(component_unit(component))
+        scale, unit = drawn_unit(rows["unit"].iloc[0] if "unit" in rows else component_unit(component))
         good = rows["accepted"].to_numpy(dtype=bool)
         t, r = rows["time_s"].to_numpy(), scale * rows["residual"].to_numpy()
         sd = scale * rows["predicted_sd"].to_numpy()
@@ -64,7 +88,7 @@ def figure_residuals(flight: Reconstruction) -> Figure:
         ax.set_ylim(-limit, limit)
     axes[-1].set_xlabel(TIME)
     title = "Residuals before each update with 3 sd; edited points crossed, arrows where they lie outside"
-    return titled(figure, title, flight.flight)
+    return titled(figure, title, words_of(flown))
 
 
 def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) -> None:
@@ -76,8 +100,19 @@ def _edited(ax: Axes, time_s: FloatArray, residual: FloatArray, limit: float) ->
 
 
 @in_style
-def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
-    """Standard deviations of filter and smoother, and their difference over its own (McReynolds)."""
+def figure_filter_and_smoother(flown: Drawable) -> Figure:
+    """Standard deviations of filter and smoother, and their difference over its own (McReynolds).
+
+    Parameters
+    ----------
+    flown : Reconstruction, or Deflections of one
+
+    Raises
+    ------
+    GateError
+        Of a run, which does not store the filter's trajectory, and where there is none.
+    """
+    flight = reconstruction_of("figure_filter_and_smoother", flown, "filter's trajectory")
     bet = flight.solution
     filtered, smoothed = bet.filtered, bet.smoothed
     assert filtered.covariance is not None
@@ -110,12 +145,26 @@ def figure_filter_and_smoother(flight: Reconstruction) -> Figure:
     for ax in grid[-1]:
         ax.set_xlabel(TIME)
     title = "Filter against smoother: standard deviations, and the difference over its own (dotted: 3 sd)"
-    return titled(figure, title, flight.flight)
+    return titled(figure, title, words_of(flown))
 
 
 @in_style
-def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
-    """As-flown density and wind along altitude with prior and posterior bands; measured over predicted drag."""
+def figure_air(flown: Drawable) -> Figure:
+    """As-flown density and wind along altitude with prior and posterior bands; measured over predicted drag.
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no trajectory, or no as-flown atmosphere.
+    """
+    flight = bet_of("figure_air", flown)
+    day = flight.as_flown
+    if day is None:
+        raise lacking("figure_air", flight, "as-flown atmosphere", "a flight with vehicle and accelerometers")
     figure = Figure(figsize=(9.6, 6.6))
     upper, lower = list(np.asarray(figure.subfigures(2, 1, height_ratios=(1.7, 1.0))))
     axes = upper.subplots(1, 3, sharey=True)
@@ -132,7 +181,9 @@ def figure_air(flight: Reconstruction, day: ReconstructedAir) -> Figure:
     axes[0].set(xlabel="density / sounding's density", ylabel="altitude (km)")
     upper.legend(*axes[1].get_legend_handles_labels(), ncols=3, loc="outside lower left")
     _drag(lower.subplots(), day.drag)
-    return titled(figure, "As-flown atmosphere from the deceleration along the reconstructed trajectory", flight.flight)
+    return titled(
+        figure, "As-flown atmosphere from the deceleration along the reconstructed trajectory", words_of(flown)
+    )
 
 
 def _along_height(
@@ -164,14 +215,26 @@ def _drag(ax: Axes, drag: pd.DataFrame) -> None:
 
 
 @in_style
-def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
-    """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with its 3-sd band."""
-    comparison = check.comparison
-    assert comparison is not None
+def figure_attitude(flown: Drawable) -> Figure:
+    """Attitude from magnetometer and Sun minus the trajectory's about three body axes, with its 3-sd band.
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+
+    Raises
+    ------
+    GateError
+        Where there is no such comparison.
+    """
+    table, independent = _attitude(flown)
     figure = Figure(figsize=(7.2, 7.0))
     axes = figure.subplots(3, 1, sharex=True)
-    t, off, sd = comparison.time_s, np.rad2deg(comparison.difference_body_rad), np.rad2deg(comparison.sd_body_rad)
-    own = np.rad2deg(resample(flight.solution.smoothed, t).sd()[:, 6:9])
+    t = table["t_s"].to_numpy()
+    off, sd, own = (
+        table[[f"{name.format(a)}_deg" for a in "xyz"]].to_numpy()
+        for name in ("difference_{}_body", "difference_{}_body_sd", "bet_{}_body_sd")
+    )
     # stretches without Sun or field have no rows; a line across them would show what nobody measured
     whole = np.append(np.diff(t) < 1.5 * float(np.median(np.diff(t))), True)
     for k, (ax, axis) in enumerate(zip(axes, "xyz", strict=True)):
@@ -186,20 +249,47 @@ def figure_attitude(flight: Reconstruction, check: AttitudeCheck) -> Figure:
         ax.set_ylabel(f"about body {axis} (deg)\nrms {float(np.sqrt(np.mean(off[:, k] ** 2))):.2f}")
         far = 1.4 * max(float(np.percentile(np.abs(off[:, k]), 99.5)), 3.0 * float(np.median(sd[:, k])))
         ax.set_ylim(-far, far)
-    figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=2, loc="outside lower left")
     axes[-1].set_xlabel(TIME)
-    remark = "\n(not independent: the trajectory depends on these sensors too)" if check.dependence else ""
-    return titled(
-        figure, "Attitude from magnetometer and Sun sensors alone against the trajectory's" + remark, flight.flight
-    )
+    title = "Attitude from magnetometer and Sun sensors alone against the trajectory's"
+    if not independent:
+        title += "\n(not independent: the trajectory depends on these sensors too)"
+    return titled(figure, title, words_of(flown))
+
+
+def _attitude(flown: Drawable) -> tuple[pd.DataFrame, bool]:
+    """Table of the comparison (``attitude_check.csv``), and whether the two attitudes are independent."""
+    flight = bet_of("figure_attitude", flown)
+    if isinstance(flight, Run) and "attitude_check" in flight.tables:
+        return flight.tables["attitude_check"], flight.summary["attitude_check"]["independent"]
+    if isinstance(flight, Run) or flight.attitude is None or flight.attitude.comparison is None:
+        wanted = "a flight with magnetometer and Sun sensors"
+        raise lacking("figure_attitude", flight, "attitude by magnetometer and Sun", wanted)
+    return attitude_table(flight.attitude, flight.solution), not flight.attitude.dependence
 
 
 @in_style
-def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
+def figure_sensitivity(flown: Drawable, table: pd.DataFrame | None = None) -> Figure:
     """Change of each group of quantities at peak pressure in standard deviations, a bar a rerun.
 
     Diamonds: the same over what the change itself should be, where that is known.
+
+    Parameters
+    ----------
+    flown : Reconstruction, Run or Deflections
+    table : DataFrame, optional
+        ``sensitivity.csv``. A run has its own; otherwise the flight is reconstructed again without each source.
+
+    Raises
+    ------
+    GateError
+        Where there is no trajectory, or a run without the table.
     """
+    if table is None:
+        flight = bet_of("figure_sensitivity", flown)
+        stored = flight.tables.get("sensitivity") if isinstance(flight, Run) else None
+        what = "sensitivity.csv"
+        table = sensitivity(reconstruction_of("figure_sensitivity", flown, what)) if stored is None else stored
     names = list(dict.fromkeys(table["rerun"]))
     failed = set(table["rerun"][table["quantity"].isna()])
     shown = largest_of_groups(table)
@@ -224,4 +314,4 @@ def figure_sensitivity(flight: Reconstruction, table: pd.DataFrame) -> Figure:
         ax.set_visible(False)
     title = "Change at peak dynamic pressure when a source is left out or an assumption changed\n"
     title += "bars: in reported standard deviations; diamonds: in those of the change itself; dotted: 3"
-    return titled(figure, title, flight.flight)
+    return titled(figure, title, words_of(flown))

@@ -47,7 +47,7 @@ from postflight.reconciliation.posterior import (
 )
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.streams import on_one_thread
-from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, without_fit
+from postflight.studies.preflight import ENTRIES, Bounds, entry_bounds, shares, without_fit
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.dispersions import Factor, JointDispersions
@@ -106,9 +106,7 @@ class Reconciliation(Tabular):
 
     def shares_inside(self, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
         """Share of the pressure pulse inside each band: ``joint, quantity, share_inside, ...``."""
-        from postflight.studies.commands import compared_with_bounds  # matplotlib, for whoever only fits
-
-        return compared_with_bounds(self.bet, rigid, flexible)[0]
+        return shares(self.bet, rigid, flexible)
 
     def to_frame(self) -> pd.DataFrame:
         """The rows of ``joint.csv``: stiffness, damping, offset, stability, with a priori and posterior sd."""
@@ -172,8 +170,9 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
         with_fit = beside.submit(entry_bounds, kept, laws_flown, ENTRIES, 0, None, vehicle)
         # a third of a second to import, while the other process flies
         from postflight.plots.reconciliation import figure_modes, figure_posterior, figure_reconciled
+        from postflight.plots.studies import figure_preflight
         from postflight.plots.style import draw
-        from postflight.studies.commands import bands, compared_with_bounds
+        from postflight.studies.commands import bands
 
         modal, no_modes = _modes(flight, fit)
         fused, rigid = no_fit.result()
@@ -184,8 +183,8 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
             out.write_csv("joint_correlations.csv", correlations(fit))
             checks = credibility(fit, modal)
             out.write_csv("consistency_checks.csv", pd.DataFrame([vars(each) for each in checks]))
-            deflection = deflection_of(fit)
-            out.write_csv("deflection_reconciled.csv", deflection.to_frame())
+            found = Reconciliation(flight, fit)
+            out.write_csv("deflection_reconciled.csv", found.deflection.to_frame())
             facts = _summary(fit, table, odds, checks)
             facts |= _modal_summary(modal, no_modes) | _posterior_summary(posterior)
             out.write_json("reconciliation.json", facts)
@@ -195,15 +194,15 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
                 out.write_csv("posterior_summary.csv", posterior_summary(posterior))
             figures = out.path / "figures"
             if modal is not None:
-                draw(figures / "modes.png", figure_modes, modal, telemetry)
+                draw(figures / "modes.png", figure_modes, found, modal)
             if posterior is not None:
-                draw(figures / "posterior.png", figure_posterior, posterior, telemetry)
-            draw(figures / "reconciled.png", figure_reconciled, fit, telemetry, deflection, fused)
+                draw(figures / "posterior.png", figure_posterior, found, posterior)
+            draw(figures / "reconciled.png", figure_reconciled, found, fused)
             flexible = with_fit.result()
-            shares, _, bands_picture = compared_with_bounds(flight, rigid, flexible)
+            inside = shares(flight, rigid, flexible)
             out.write_csv("bands.csv", bands(rigid, flexible))
-            out.write_csv("bands_shares.csv", shares)
-            draw(figures / "bands.png", bands_picture)
+            out.write_csv("bands_shares.csv", inside)
+            draw(figures / "bands.png", figure_preflight, flight, rigid, flexible)
     _print_joint(fit, table, odds)
     print_checks(checks, "fit")
     if posterior is not None:
@@ -213,10 +212,10 @@ def run(folder: Path, laws: tuple[str, ...], sampled: bool) -> None:
     else:
         by_modes = f"{modal.stiffness_nmprad:.0f} +/- {modal.sd_nmprad:.0f} N m/rad"
         console.print(f"stiffness by the joint's frequency: {by_modes}")
-    inside = ", ".join(
-        f"{r.joint} {100 * r.share_inside:.0f} % ({r.quantity.split('_')[0]})" for r in shares.itertuples(index=False)
+    within = ", ".join(
+        f"{r.joint} {100 * r.share_inside:.0f} % ({r.quantity.split('_')[0]})" for r in inside.itertuples(index=False)
     )
-    console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {inside}")
+    console.print(f"the flight lies inside the bands of {ENTRIES} entries, of the pulse: {within}")
     console.print(f"results in {escape(str(out.path))}")
 
 

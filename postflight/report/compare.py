@@ -24,7 +24,7 @@ from postflight.report.source import kept_rows, rounded
 from postflight.report.text import cell, date
 from postflight.report.write import charts, pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
-from postflight.runs import RunTables, find_run, is_complete, read_tables
+from postflight.runs import Run, find_run, is_complete, read_tables
 from postflight.systematic_differences import digits
 from postflight.terminal import terminal
 
@@ -123,12 +123,12 @@ def _compare_with_file(words: tuple[str, ...], output: Path | None) -> None:
     console.print(escape(f"tables and {PAGE_NAME} in {folder}"), highlight=False)
 
 
-def _default_folder(runs: tuple[RunTables, ...], others: tuple[str, ...]) -> Path:
+def _default_folder(runs: tuple[Run, ...], others: tuple[str, ...]) -> Path:
     called = [run.name or run.path.name.split("-")[1] for run in runs]
     return runs[0].path.parent.parent / "comparisons" / "-and-".join((*called, *others))
 
 
-def _write(folder: Path, runs: tuple[RunTables, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
+def _write(folder: Path, runs: tuple[Run, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
     """Write everything beside the folder and rename; an earlier comparison there is replaced, nothing else."""
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= _FILES):
         raise GateError(f"{folder}: exists and is no comparison; name another with --output", "file-exists")

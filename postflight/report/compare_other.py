@@ -18,7 +18,7 @@ from postflight.report.panels import Panel, line_of, panel_of
 from postflight.report.source import kept_rows, rounded
 from postflight.report.text import date
 from postflight.report.write import charts, rendered
-from postflight.runs import RunTables, trajectory_of
+from postflight.runs import Run, trajectory_of
 from postflight.systematic_differences import SystematicDifferences, digits, systematic_differences
 from postflight.terminal import terminal
 
@@ -27,7 +27,7 @@ _TITLES = {"position": ("Position", "m"), "velocity": ("Velocity", "m/s"), "atti
 console = terminal()
 
 
-def compare_with_other(run: RunTables, path: Path) -> tuple[SystematicDifferences, dict[str, pd.DataFrame], str]:
+def compare_with_other(run: Run, path: Path) -> tuple[SystematicDifferences, dict[str, pd.DataFrame], str]:
     """Compare a run with another source's file: what was found, its tables by `OTHER_TABLES`, the page.
 
     Raises
@@ -44,7 +44,7 @@ def compare_with_other(run: RunTables, path: Path) -> tuple[SystematicDifference
     return found, tables, _page(run, found, tables)
 
 
-def _covariance(run: RunTables) -> tuple[FloatArray, FloatArray]:
+def _covariance(run: Run) -> tuple[FloatArray, FloatArray]:
     """Times (k,) and matrices (k, 9, 9)."""
     path = run.path / "covariance.npz"
     try:
@@ -87,7 +87,7 @@ def _chi_square_cells(found: SystematicDifferences) -> tuple[list[str], list[lis
     return ["part", "as given", "less the effects", "limit (99.9 %)"], rows
 
 
-def _page(run: RunTables, found: SystematicDifferences, tables: dict[str, pd.DataFrame]) -> str:
+def _page(run: Run, found: SystematicDifferences, tables: dict[str, pd.DataFrame]) -> str:
     span = [float(found.time_s[0]), float(found.time_s[-1])]
     data = charts(run, span, span, _panels(found, tables["differences_over_time"]))
     effects, chi_square = (

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from postflight.report.source import Run, read_run
 from postflight.report.write import write_whole
+from postflight.runs import Run, read_run
 
 
 def write_notebook(flight_folder: Path, target: Path | None = None, path: Path | None = None) -> Path:

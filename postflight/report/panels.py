@@ -21,8 +21,9 @@ from flightmodel.statistics import BAND_COLUMNS, chi_square_quantile, inside
 from flightmodel.tables import column_about
 from postflight.deflections import METHODS
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
-from postflight.report.source import Rows, Run, kept_rows, rounded
+from postflight.report.source import Rows, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
+from postflight.runs import Run
 from recon.measurements import component_unit
 
 _TRAJECTORY_ROWS, _RAW_POINTS = 6000, 8000

@@ -18,7 +18,7 @@ from flightmodel.film import Image
 from flightmodel.telemetry import Telemetry
 from postflight.filming import by_camera
 from postflight.plots.overlay import deflection_at, oriented_camera
-from postflight.report.source import Run
+from postflight.runs import Run
 
 _WIDTH_PX, _WORST = 480, 5
 QUALITIES, LARGEST_CHARACTERS = (78, 60, 40, 20), 600_000  # the whole strip stays below, or has the last quality

@@ -1,53 +1,14 @@
-"""What is a report made from? A finished run's files, the telemetry behind them, and the rows of them to draw.
+"""Which rows of a run's long tables does a report draw?
 
 Of long series the smallest and the largest value of each of equal runs of rows are drawn: every extreme stays.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
-from flightmodel.checks import FloatArray, GateError
-from flightmodel.flightfolder import read_flight
-from flightmodel.telemetry import Telemetry
-from postflight.runs import RunTables, find_run, read_tables
-
-
-@dataclass(frozen=True)
-class Run(RunTables):
-    """A complete run with the telemetry that it was made from.
-
-    Parameters
-    ----------
-    telemetry : Telemetry
-        As the run read it.
-    """
-
-    telemetry: Telemetry
-
-
-def read_run(flight_folder: Path, path: Path | None = None, telemetry: Telemetry | None = None) -> Run:
-    """Read a run, the last complete one unless one is named, and its telemetry unless it is at hand.
-
-    Raises
-    ------
-    GateError
-        Where there is no complete run, a file of it is missing, or the telemetry is not what the run was made from.
-    """
-    read = read_tables(find_run(flight_folder) if path is None else path)
-    telemetry = read_flight(flight_folder) if telemetry is None else telemetry
-    then, now = read.facts["inputs_sha256"], telemetry.hashes
-    changed = sorted(name for name in then.keys() | now.keys() if then.get(name) != now.get(name))
-    if changed:
-        again = f"use `postflight run {flight_folder}` again"
-        words = f"{flight_folder}: changed since the run {read.path.name}: {', '.join(changed)}; {again}"
-        raise GateError(words, "inputs-changed")
-    return Run(**vars(read), telemetry=telemetry)
-
+from flightmodel.checks import FloatArray
 
 Rows = NDArray[np.int64]
 

@@ -17,9 +17,9 @@ from flightmodel.config import parse_utc
 from flightmodel.deflection import QUANTILES, interpolation_error, lateral_axes, lv_clock, lv_direction
 from postflight.deflections import METHODS
 from postflight.plots.style import COLOUR, LABEL
-from postflight.report.source import Run
 from postflight.report.view_3d import best_method, hole_s
 from postflight.run_folder import answer_table
+from postflight.runs import Run
 from postflight.sensitivity import largest_of_groups
 from recon.consistency import doubt
 

@@ -14,8 +14,9 @@ from flightmodel.checks import FloatArray
 from flightmodel.deflection import HOLE_FACTOR, lv_direction
 from flightmodel.geometry import aft_profile, forward_profile, revolved, rim_curve
 from flightmodel.vehicle import Vehicle
-from postflight.report.source import Rows, Run, rounded
+from postflight.report.source import Rows, rounded
 from postflight.run_folder import answer_table
+from postflight.runs import Run
 
 _CONE_PIECES, _POSES = 8, 3000
 

@@ -24,7 +24,7 @@ from markupsafe import Markup
 from flightmodel.airdata import pressure_pulse
 from flightmodel.config import parse_utc
 from flightmodel.files import write_file, writing
-from flightmodel.telemetry import Telemetry
+from postflight.flight import Flight
 from postflight.plots.style import COLOUR, PAGE
 from postflight.report import text, view_3d
 from postflight.report.panels import (
@@ -37,8 +37,8 @@ from postflight.report.panels import (
     trajectory_panels,
     trajectory_rows,
 )
-from postflight.report.source import Run, read_run, rounded
-from postflight.runs import RunTables
+from postflight.report.source import rounded
+from postflight.runs import Run, read_run
 
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -65,7 +65,7 @@ _KEYS: dict[str, tuple[tuple[str, tuple[str, ...], _Stated], ...]] = {
 def write_report(
     flight_folder: Path,
     path: Path | None = None,
-    telemetry: Telemetry | None = None,
+    flight: Flight | None = None,
     target: Path | None = None,
     studies: tuple[Path, ...] = (),
 ) -> Path:
@@ -78,7 +78,7 @@ def write_report(
     GateError
         Where the run cannot be read, or the file not be written.
     """
-    run = read_run(flight_folder, path, telemetry)
+    run = read_run(flight_folder, path, flight)
     target = run.path / _NAME if target is None else target
     write_whole(target, page(run, studies))
     return target
@@ -206,7 +206,7 @@ def _numbers(
     return data, absent
 
 
-def charts(run: RunTables, span: list[float], first: list[float], panels: list[Panel], **more: Any) -> dict[str, Any]:
+def charts(run: Run, span: list[float], first: list[float], panels: list[Panel], **more: Any) -> dict[str, Any]:
     """What a page's scripts draw: whole time and the part shown first, events of a run, panels, and ``more``.
 
     Only the report itself has columns of the trajectory (``bet``, ``rows``) and ``poses``.

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from rich.markup import escape
 
-from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import GateError
-from flightmodel.earth import STANDARD_GRAVITY_MPS2
-from flightmodel.statistics import BAND_COLUMNS, inside
+from flightmodel.statistics import BAND_COLUMNS
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.commands import compile_kernels, console
 from postflight.flight import read_flight
@@ -21,16 +16,14 @@ from postflight.montecarlo.bands import write_csv
 from postflight.montecarlo.study import read_study
 from postflight.plots import studies
 from postflight.plots.style import draw
-from postflight.reconstruction import Reconstruction, reconstruct
+from postflight.reconstruction import reconstruct
 from postflight.studies import joints
 from postflight.studies.joints import table_3_1
-from postflight.studies.preflight import Bounds, entry_bounds
+from postflight.studies.preflight import Bounds, entry_bounds, pulse_columns, shares
 from postflight.studies.shell_test import fit_laws, read_load_test
 from postflight.terminal import progress_bar
 from postflight.warmup import RECONSTRUCTION
 from synthetic_flight.scenarios import read_scenario
-
-Drawing = Callable[[], studies.Figure]
 
 
 def stiffness_and_damping(vehicle: str, folder: Path) -> None:
@@ -39,7 +32,7 @@ def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     table = table_3_1(known)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "table_3_1.csv", table)
-    draw(folder / "table_3_1.png", studies.figure_table_3_1, table, f"vehicle: {known.name}")
+    draw(folder / "table_3_1.png", studies.figure_table_3_1, known)
     names = ("study", "Hz", "% of c*", "quantity", "paper", "ours", "vehicle's own")
     rows = [
         (r.study, f"{r.frequency_hz:g}", f"{r.damping_percent:g}", r.quantity, r.paper, r.ours, f"{r.vehicle:.5g}")
@@ -50,34 +43,17 @@ def stiffness_and_damping(vehicle: str, folder: Path) -> None:
     console.print(f"results in {escape(str(folder))}")
 
 
-_ALPHA, _NORMAL = "centerbody total angle of attack (deg)", "centerbody normal acceleration (g)"
-# study: what flies it, title of its figures, and their number, quantity and label
-_JOINT_STUDIES = {
-    "damping": (
-        joints.damping_study, "Damping of the joint at 2.5 Hz, % of critical", (("3.1", "alpha_total_deg", _ALPHA),),
-    ),
-    "stiffness": (
-        joints.stiffness_study, "Stiffness of the joint at 0.5 % of critical",
-        (("3.2", "alpha_total_deg", _ALPHA), ("3.3", "normal_g", _NORMAL)),
-    ),
-}  # fmt: skip
-
-
 def joint_study(name: str, scenario: str, folder: Path, seed: int) -> None:
     """Fly the study of the joint's ``damping`` or ``stiffness``; write it, and print it beside the paper's words."""
     chosen = read_scenario(scenario)
     compile_kernels("simulator", "ensembles")
-    fly, title, figures = _JOINT_STUDIES[name]
-    study = fly(chosen, seed)
+    study = joints.STUDIES[name](chosen, seed)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / f"{name}.csv", study.table)
     write_csv(folder / f"{name}_paper.csv", study.paper)
     write_csv(folder / f"{name}_histories.csv", joints.histories(study))
-    synthetic = f"SYNTHETIC flights of {chosen.spec.name}"
-    for number, quantity, label in figures:
-        words = f"{title} (AIAA 2011-2571, Figure {number})"
-        path = folder / f"figure_{number.replace('.', '_')}.png"
-        draw(path, studies.figure_joints, study, quantity, label, words, synthetic)
+    for number in (figure for figure, (own, *_) in studies.JOINT_FIGURES.items() if own == name):
+        draw(folder / f"figure_{number.replace('.', '_')}.png", studies.figure_joints, chosen, number, study)
     later = f"{joints.LATER_S[0]:g} to {joints.LATER_S[1]:g} s later"
     rows = []
     for r in study.table.itertuples():
@@ -124,12 +100,12 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
         flight.required_loads()
         rigid = entry_bounds(flight, None, flights, seed, lambda f, what: report(0.4 + 0.3 * f, what))
         flexible = entry_bounds(flight, joint, flights, seed, lambda f, what: report(0.7 + 0.3 * f, what))
-    table, flown, picture = compared_with_bounds(flight, rigid, flexible)
+    table = shares(flight, rigid, flexible)
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "preflight.csv", table)
     write_csv(folder / "preflight_bands.csv", bands(rigid, flexible))
-    write_csv(folder / "preflight_flight.csv", flown)
-    draw(folder / "figure_1_3.png", picture)
+    write_csv(folder / "preflight_flight.csv", pulse_columns(flight))
+    draw(folder / "figure_1_3.png", studies.figure_preflight, flight, rigid, flexible)
     names = ("joint", "quantity", "inside", "over the median", "peak / 97.7 %", "diverged")
     rows = [
         (r.joint, r.quantity, f"{100 * r.share_inside:.1f} %", f"{r.over_median_at_peak:.3g}",
@@ -140,60 +116,6 @@ def preflight(flight_folder: Path, folder: Path, dispersions: str, flights: int,
     console.table(title, names, rows, words=("quantity",))
     console.print("paper: angle of attack 4 to 5 deg above the median, peak normal acceleration over twice the bound")
     console.print(f"results in {escape(str(folder))}")
-
-
-def compared_with_bounds(
-    flight: Reconstruction, rigid: Bounds, flexible: Bounds
-) -> tuple[pd.DataFrame, pd.DataFrame, Drawing]:
-    """Return `shares`, the flight's own columns ``time_s, alpha_total_deg, normal_g``, and what draws both."""
-    pulse = flight.required_loads()
-    alpha_deg = np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad))
-    normal_g = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
-    flown = pd.DataFrame({"time_s": pulse.time_s, "alpha_total_deg": alpha_deg, "normal_g": normal_g})
-    table = shares(flight, flown, rigid, flexible)
-    remark = "inside, of the pulse: " + "; ".join(
-        f"{joint} {quantity.split('_')[0]} {100 * share:.0f} %"
-        for joint, quantity, share in zip(table["joint"], table["quantity"], table["share_inside"], strict=True)
-    )
-    tag = "SYNTHETIC flight" if flight.telemetry.synthetic else "flight"
-    first_s, last_s = _pulse_span(flight)
-    window = first_s - 10.0, last_s + 5.0
-    title = f"{flight.telemetry.name}: {tag}"
-    return table, flown, partial(studies.figure_preflight, rigid, flexible, flown, window, remark, title)
-
-
-def _pulse_span(flight: Reconstruction) -> tuple[float, float]:
-    times = flight.air.time_s[pressure_pulse(flight.air.dynamic_pressure_pa)]
-    return float(times[0]), float(times[-1])
-
-
-def shares(flight: Reconstruction, flown: pd.DataFrame, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
-    """Share of the pulse's samples between the outer percentiles, by joint and quantity; excess of the others.
-
-    Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where
-    the flight has its peak, ``over_median_at_peak`` and ``peak_over_upper`` (a ratio); ``diverged`` flights.
-    """
-    rows = flown[flown["time_s"].between(*_pulse_span(flight))]
-    if rows.empty:
-        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="time-not-covered")
-    time_s, out = rows["time_s"].to_numpy(), []
-    for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
-        for quantity, (band, _) in bounds.by_quantity.items():
-            values = rows[quantity].to_numpy()
-            at = int(np.argmax(values))
-            middle, upper = (np.interp(time_s, bounds.time_s, band[k]) for k in (1, 2))
-            out.append(
-                {
-                    "joint": joint,
-                    "quantity": quantity,
-                    "share_inside": float(np.mean(inside(time_s, values, bounds.time_s, band[0], band[2]))),
-                    "largest_excess": float(np.max(values - upper)),
-                    "over_median_at_peak": float(values[at] - middle[at]),
-                    "peak_over_upper": float(values[at] / upper[at]),
-                    "diverged": bounds.ended,
-                }
-            )
-    return pd.DataFrame(out)
 
 
 def bands(rigid: Bounds, flexible: Bounds) -> pd.DataFrame:

@@ -255,3 +255,6 @@ def table_3_1(vehicle: Vehicle) -> pd.DataFrame:
     table = pd.DataFrame(rows, columns=columns)
     table.insert(7, "agrees", table["ours"] == table["paper"])
     return table
+
+
+STUDIES = {"damping": damping_study, "stiffness": stiffness_study}

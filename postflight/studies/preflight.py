@@ -26,7 +26,8 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.atmosphere import AtmosphereProfile, profile_from_sounding
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.deflection import DeflectionHistory
-from flightmodel.statistics import percentile_band
+from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.statistics import inside, percentile_band
 from flightmodel.tables import column_about
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Uncertainty, Vehicle
@@ -92,6 +93,16 @@ class Bounds:
             for part, values in zip(("low", "median", "high", "nominal"), (*bands, nominal), strict=True):
                 columns[column_about(quantity, part)] = values
         return pd.DataFrame(columns).assign(flights=self.flights)
+
+
+def bounds_of(table: pd.DataFrame) -> Bounds:
+    """Bounds from their columns in ``rigid_bounds.csv``."""
+    angle, force = (
+        [table[column_about(quantity, part)].to_numpy(dtype=float) for part in ("low", "median", "high", "nominal")]
+        for quantity in ("alpha_total_deg", "normal_g")
+    )
+    bands = np.array(angle[:3]), np.array(force[:3])
+    return Bounds(table["t_s"].to_numpy(dtype=float), *bands, angle[3], force[3], int(table["flights"].iloc[0]))
 
 
 def dispersions_of(stated: Uncertainty, joint: JointDispersions | None) -> Dispersions:
@@ -227,3 +238,44 @@ def _dispersed_atmosphere(profile: AtmosphereProfile, rng: np.random.Generator) 
 def without_fit(flight: Reconstruction, camera: DeflectionHistory | None) -> tuple[DeflectionHistory | None, Bounds]:
     """Fused deflection, with what the camera reads without a trajectory, and bands of entries with the joint locked."""
     return fused_history(flight, camera), entry_bounds(flight, None, ENTRIES)
+
+
+# the flight against the bands
+
+
+def pulse_columns(flight: Reconstruction) -> pd.DataFrame:
+    """The flight's own columns ``time_s, alpha_total_deg, normal_g``, at the times of its loads."""
+    pulse = flight.required_loads()
+    alpha_deg = np.rad2deg(np.interp(pulse.time_s, flight.air.time_s, flight.air.alpha_total_wind_rad))
+    normal_g = np.hypot(*pulse.specific_force_body_mps2[:, 1:].T) / STANDARD_GRAVITY_MPS2
+    return pd.DataFrame({"time_s": pulse.time_s, "alpha_total_deg": alpha_deg, "normal_g": normal_g})
+
+
+def shares(flight: Reconstruction, rigid: Bounds, flexible: Bounds) -> pd.DataFrame:
+    """Share of the pulse's samples between the outer percentiles, by joint and quantity; excess of the others.
+
+    Columns ``joint, quantity, share_inside, largest_excess`` (over the upper percentile, in the quantity's unit); where
+    the flight has its peak, ``over_median_at_peak`` and ``peak_over_upper`` (a ratio); ``diverged`` flights.
+    """
+    flown = pulse_columns(flight)
+    rows = flown[flown["time_s"].between(*flight.pulse_s)]
+    if rows.empty:
+        raise GateError("pre-flight bounds: the flight has no sample in its pulse", code="time-not-covered")
+    time_s, out = rows["time_s"].to_numpy(), []
+    for joint, bounds in (("rigid", rigid), ("flexible", flexible)):
+        for quantity, (band, _) in bounds.by_quantity.items():
+            values = rows[quantity].to_numpy()
+            at = int(np.argmax(values))
+            middle, upper = (np.interp(time_s, bounds.time_s, band[k]) for k in (1, 2))
+            out.append(
+                {
+                    "joint": joint,
+                    "quantity": quantity,
+                    "share_inside": float(np.mean(inside(time_s, values, bounds.time_s, band[0], band[2]))),
+                    "largest_excess": float(np.max(values - upper)),
+                    "over_median_at_peak": float(values[at] - middle[at]),
+                    "peak_over_upper": float(values[at] / upper[at]),
+                    "diverged": bounds.ended,
+                }
+            )
+    return pd.DataFrame(out)

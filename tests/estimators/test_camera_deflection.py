@@ -23,7 +23,7 @@ from flightmodel.checks import GateError, Issue
 from flightmodel.deflection import lv_direction, rotation_vector_body_shell
 from flightmodel.geometry import ShellGeometry, dot_positions
 from flightmodel.vehicle import CameraMount
-from postflight.plots.paper_figures import figure_2_3
+from postflight.plots.paper_figures import frames_with_camera
 from synthetic_flight.film import render_video
 from tests.oracles.plain_fit import plain_fit
 from tests.refusing import numbers_in
@@ -421,7 +421,7 @@ def test_overlay_covers_the_right_half_and_the_figure_draws():
         painted = np.argmax(np.ptp(picture[:, column].astype(int), axis=1) > 25)
         bright = np.argmax(frames[1][:, column] > 0.5 * frames[1][painted + 5, column])
         assert abs(painted - bright) <= 3
-    figure = figure_2_3(oriented, frames, [421.0, 440.0], [0.0, theta], [plane, plane])
+    figure = frames_with_camera(oriented, frames, [421.0, 440.0], [0.0, theta], [plane, plane])
     assert len(figure.axes) == 2
     assert len(figure.axes[1].lines) == 2
     rows = [line.get_ydata()[0] for line in figure.axes[1].lines]

@@ -146,7 +146,7 @@ def test_history_from_lateral_vectors_has_the_covariance_of_a_monte_carlo():
 def test_a_flat_piece_of_a_swinging_history_is_no_better_known_between_answers():
     theta = np.array([0.03, 0.07, 0.03, 0.05, 0.05, 0.05, 0.05, 0.07, 0.03, 0.07])
     history = DeflectionHistory(np.arange(10.0), theta, np.zeros(10), np.tile(np.eye(2) * 1e-6, (10, 1, 1)), "camera")
-    value, sd = history.at(4.5)
+    value, sd = history.angle_at(4.5)
     assert value == pytest.approx(0.05)
     assert sd == pytest.approx(0.125 * 0.06, rel=0.02)  # the largest second difference, 0.06, about here
 
@@ -154,7 +154,7 @@ def test_a_flat_piece_of_a_swinging_history_is_no_better_known_between_answers()
 def test_history_between_and_outside_its_answers():
     t, theta = np.array([0.0, 1.0, 2.0, 3.0]), np.array([np.nan, 0.02, 0.04, np.nan])
     history = DeflectionHistory(t, theta, np.zeros(4), np.tile(np.eye(2) * 1e-4, (4, 1, 1)), "camera")
-    assert history.at(1.5) == pytest.approx((0.03, 0.01))
-    assert np.isnan(history.at(0.5)[0])
+    assert history.angle_at(1.5) == pytest.approx((0.03, 0.01))
+    assert np.isnan(history.angle_at(0.5)[0])
     with refuses("argument-value"):
         DeflectionHistory(t[::-1].copy(), theta, np.zeros(4), None, "camera")

@@ -9,13 +9,14 @@ import matplotlib.figure
 import numpy as np
 import pytest
 
+from flightmodel.checks import GateError
 from flightmodel.telemetry import Motion
 from flightmodel.trajectory import difference
 from postflight import plots
 from postflight.flight import Flight
 from postflight.plots import style
 from postflight.plots.run_figures import draw_trajectory
-from postflight.plots.style import in_style, save
+from postflight.plots.style import FigureFolder, in_style, save
 from postflight.plots.trajectory import (
     figure_attitude,
     figure_filter_and_smoother,
@@ -95,7 +96,7 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
     # of trackers that are all left out there are no residuals to draw
     alone = replace(ballistic.solution, residuals=ballistic.solution.residuals.assign(used=False))
     (tmp_path / "without").mkdir()
-    draw_trajectory(replace(ballistic, solution=alone), tmp_path / "without")
+    draw_trajectory(replace(ballistic, solution=alone), FigureFolder(tmp_path / "without"))
     assert {path.name for path in (tmp_path / "without").iterdir()} == {"flown.png", "filter_and_smoother.png"}
     found = sensitivity(ballistic)
     assert not found.quantity.astype(str).str.contains("rotation|attack").any()
@@ -104,19 +105,35 @@ def test_without_attitude_nothing_is_drawn_of_it(ballistic, tmp_path):
 
 
 def test_attitude_figure_states_dependence(flight, tmp_path):
-    free = figure_attitude(flight, flight.attitude)
+    free = figure_attitude(flight)
     drawn(free, tmp_path / "attitude.png")
-    resting = figure_attitude(flight, replace(flight.attitude, dependence="filter"))
+    resting = figure_attitude(replace(flight, attitude=replace(flight.attitude, dependence="filter")))
     assert len(free.get_suptitle().splitlines()) == 1
     assert len(resting.get_suptitle().splitlines()) == 2
 
 
-def test_same_data_give_the_same_bytes_and_the_callers_style_stays(flight, tmp_path):
+@pytest.mark.parametrize("form", style.FORMATS)
+def test_same_data_give_the_same_bytes_and_the_callers_style_stays(flight, tmp_path, form):
     before = dict(matplotlib.rcParams)
-    for name in ("a.png", "b.png"):
-        save(figure_filter_and_smoother(flight), tmp_path / name)
-    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    first, second = tmp_path / f"a.{form}", tmp_path / f"b.{form}"
+    for path in (first, second):
+        save(figure_filter_and_smoother(flight), path)
+    assert first.read_bytes() == second.read_bytes()
+    assert first.read_bytes()[:5] == {"png": b"\x89PNG\r", "pdf": b"%PDF-", "svg": b"<?xml"}[form]
     assert dict(matplotlib.rcParams) == before
+
+
+def test_a_format_that_is_none_is_refused(tmp_path):
+    with pytest.raises(GateError) as fault:
+        save(matplotlib.figure.Figure(), tmp_path / "a.jpeg")
+    assert fault.value.codes == ("option-format",)
+
+
+def test_a_run_draws_every_figure_in_every_format(ballistic, tmp_path):
+    draw_trajectory(ballistic, FigureFolder(tmp_path, ("png", "svg")))
+    names = {path.name for path in tmp_path.iterdir()}
+    stems = {"flown", "filter_and_smoother", "residuals"}
+    assert names == {f"{stem}.{form}" for stem in stems for form in ("png", "svg")}
 
 
 def test_names_are_no_tex_and_logarithmic_ticks_are(flight, tmp_path):

@@ -15,6 +15,7 @@ from postflight.deflections import estimate
 from postflight.filming import camera_answer, orient_on_film
 from postflight.flight import read_flight as read_flown
 from postflight.plots import run_figures
+from postflight.plots.style import FigureFolder
 from synthetic_flight.film import Imaging
 from tests.estimators.test_camera_deflection import film as rendered
 from tests.postflight.test_bad_input import names_line, refused
@@ -207,14 +208,14 @@ def test_a_run_s_pictures_take_the_camera_as_the_answer_oriented_it(deflected, m
     answers = estimate(flown, ("camera",))
     drawn = []
 
-    def draw_camera(seen, _history, _folder):
+    def draw_cameras(seen, _history, _figures):
         drawn.append(orient_on_film(seen.telemetry.frames, seen.telemetry.required_vehicle()).view.camera)
 
-    monkeypatch.setattr(run_figures, "draw_camera", draw_camera)
-    monkeypatch.setattr(run_figures, "draw", lambda *_: None)
-    draw_camera(flown, None, None)
+    monkeypatch.setattr(run_figures, "_draw_cameras", draw_cameras)
+    monkeypatch.setattr(FigureFolder, "draw", lambda *_: None)
+    draw_cameras(flown, None, None)
     bet = SimpleNamespace(flight=copy, telemetry=copy.telemetry)
-    run_figures.draw_deflections(bet, deflected.root, pickle.loads(pickle.dumps(answers)))
+    run_figures.draw_deflections(bet, FigureFolder(deflected.root), pickle.loads(pickle.dumps(answers)))
     assert len(drawn) == 2
     for got in drawn:
         for part, own in zip(got.lens_terms, want.lens_terms, strict=True):

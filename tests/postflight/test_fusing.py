@@ -164,7 +164,7 @@ def test_quantiles_between_frames_are_as_wide_as_the_sd():
     swing = np.deg2rad(4.0 + 0.8 * np.sin(2.0 * np.pi * 1.6 * t))[:, None] * np.array([0.8, -0.6])
     sparse = film(swing, t, np.deg2rad(0.02))
     for at_s in (t[7], t[7] + 0.12):
-        theta, sd = sparse.at(at_s)
+        theta, sd = sparse.angle_at(at_s)
         low, inner_low, middle, inner_high, high = quantiles_at(sparse, at_s)
         assert middle == pytest.approx(theta, abs=0.1 * sd)
         assert 0.5 * (inner_high - inner_low) == pytest.approx(sd, rel=0.1)

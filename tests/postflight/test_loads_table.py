@@ -59,7 +59,7 @@ def test_the_runs_own_table_gives_its_answers(method, run):
     history = getattr(pf, f"estimate_{method}")(loads)
     own = pd.read_csv(run / f"deflection_{method}.csv")
     at = loads.time_s[pressure_pulse(loads.dynamic_pressure_pa)]
-    theta, sd = np.rad2deg(np.array([history.at(t) for t in at]).T)
+    theta, sd = np.rad2deg(np.array([history.angle_at(t) for t in at]).T)
     expected, stated = (np.interp(at, own.t_s, own[c]) for c in ("theta_deg", "theta_sd_deg"))
     assert abs((theta - expected).mean()) < 0.1 * stated.mean()
     assert np.abs(theta - expected).max() < 0.5 * stated.min()
@@ -129,7 +129,7 @@ def test_defaults_widen_the_answer_and_keys_replace_them(alien):
     narrow = read_loads(alien, "irve2_reference", flow_angle_sd_deg=0.05, wind_sd_mps=0.5)
     wide = read_loads(alien, "irve2_reference", flow_angle_sd_deg=1.0)
     at = narrow.time_s[np.argmax(narrow.dynamic_pressure_pa)]
-    sds = [pf.estimate_misalignment(loads).at(at)[1] for loads in (narrow, wide)]
+    sds = [pf.estimate_misalignment(loads).angle_at(at)[1] for loads in (narrow, wide)]
     assert sds[1] > 1.3 * sds[0]  # of a degree of the flow the force's tilt takes 0.12 deg, beside 0.13 deg of the rest
     with refuses("key-unknown"):
         read_loads(alien, "irve2_reference", flow_angle_deg=1.0)

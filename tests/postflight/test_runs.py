@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from flightmodel.checks import ConfigError, GateError
-from postflight import commands, flight, run_folder
+from postflight import commands, flight, plots, run_folder
 from postflight.deflections import Deflections
 from postflight.exports import read_source
 from postflight.flight import read_flight
 from postflight.reconstruction import reconstruct
-from postflight.runs import check_name, complete_runs, find_run
+from postflight.runs import check_name, complete_runs, find_run, read_run
 from tests.refusing import printed_codes
 
 ROCKET = Path(__file__).parents[1] / "data" / "real_flights" / "rocketpy_prometheus"
@@ -63,6 +63,22 @@ def test_a_run_is_found_by_each_of_its_names(flown):
         find_run(flown, "dense-aire")
     assert fault.value.codes == ("name-unknown",)
     assert "did you mean 'dense-air'?" in str(fault.value)
+
+
+def test_a_run_without_loads_is_read_back_and_says_why_it_has_none(flown):
+    """A rocket on radar alone: no inertial sensors, no deflection."""
+    run = read_run(flown, "dense-air")
+    assert run.name == "dense-air"
+    assert run.flight.changes == run.changes == ("density = 1.05",)
+    assert len(run.trajectory.time_s) == len(run.table)
+    assert run.loads is None
+    assert list(run.deflections) == []
+    assert plots.figure_flown(run).get_axes()
+    assert plots.figure_residuals(run).get_axes()
+    for figure, code in ((plots.figure_2_5, "input-missing"), (plots.figure_air, "argument-type")):
+        with pytest.raises(GateError) as fault:
+            figure(run)
+        assert fault.value.codes == (code,)
 
 
 @pytest.mark.parametrize("missing", ["run.json", "summary.json", "bet_header.json", "bet.csv"])

@@ -14,11 +14,12 @@ PYTHON += [(path, path.read_text()) for path in [ROOT / "examples" / "montecarlo
 
 @pytest.mark.slow
 def test_python_examples_run(short: Path, tmp_path: Path) -> None:
-    """All in one process, each in a scope of its own, for imports take longer than most of them."""
+    """All in one process, each page in a scope of its own, for imports take longer than most of them."""
     (tmp_path / "demo-flight").symlink_to(short, target_is_directory=True)
     for name in ("tests", "examples"):
         (tmp_path / name).symlink_to(ROOT / name, target_is_directory=True)
-    code = "\n".join(f"print({page.name!r}); exec({text!r}, {{}})" for page, text in PYTHON)
+    lines = (f"print({page.name!r}); exec({text!r}, scopes.setdefault({page.name!r}, {{}}))" for page, text in PYTHON)
+    code = "\n".join(["scopes = {}", *lines])
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(PYTHON) >= 5

@@ -106,7 +106,7 @@ def _deflection_error(history: DeflectionHistory, truth: Path) -> float:
     t = history.time_s[(history.time_s > pulse.iloc[0]) & (history.time_s < pulse.iloc[-1])]
     z = []
     for at in (peak, *t[:: max(1, len(t) // 200)]):
-        theta, sd = history.at(float(at))
+        theta, sd = history.angle_at(float(at))
         z.append((theta - np.deg2rad(np.interp(at, true.t_s, true.theta_deg))) / sd if sd > 0.0 else np.nan)
     z = np.abs(np.array(z))
     rest = np.sqrt(np.nanmean(z[1:] ** 2)) if np.isfinite(z[1:]).any() else 0.0

@@ -12,7 +12,7 @@ import pytest
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import commands
 from postflight.deflections import METHODS
-from postflight.plots import run_figures
+from postflight.plots.style import FigureFolder
 from synthetic_flight.folder import simulate_to_folder
 from synthetic_flight.scenarios import read_scenario
 from tests.in_process import draw_here
@@ -39,7 +39,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     flight = flight.replace('name = "irve2_reference"', f'name = "{HOSTILE}"', 1)
     (folder / "flight.toml").write_text(flight + f"\n[[events]]\nname = '{HOSTILE_EVENT}'\nt_s = 430.0\n")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_figures, "draw", lambda *_: None)  # nobody looks at them here
+        patch.setattr(FigureFolder, "draw", lambda *_: None)  # nobody looks at them here
         draw_here(patch)
         commands.run_flight(folder, METHODS, commands.Asked())
     return folder

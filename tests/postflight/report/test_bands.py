@@ -9,8 +9,8 @@ import pytest
 
 from flightmodel.checks import GateError
 from postflight.report import panels
-from postflight.report.source import read_run
 from postflight.report.write import page, write_report
+from postflight.runs import read_run
 from tests.refusing import numbers_in
 
 

@@ -19,9 +19,9 @@ from postflight.plots.style import COLOUR, with_holes
 from postflight.report import pictures
 from postflight.report import text as texts
 from postflight.report.panels import trajectory_panels, trajectory_rows
-from postflight.report.source import extreme_rows, kept_rows, read_run, rounded
+from postflight.report.source import extreme_rows, kept_rows, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
-from postflight.runs import read_tables
+from postflight.runs import read_run, read_tables
 from recon.consistency import doubt
 from tests.postflight.report.conftest import HOSTILE
 
@@ -185,7 +185,7 @@ def test_cards_carry_the_result_of_the_tests_of_pairs(run) -> None:
 
 def test_a_pair_that_disagrees_is_named(run) -> None:
     table = run.tables["fusion_agreement"].assign(passed=[True, False, True], chance=[0.5, 1e-4, 0.5])
-    one = type(run)(**{**vars(run), "tables": run.tables | {"fusion_agreement": table}})
+    one = replace(run, tables=run.tables | {"fusion_agreement": table})
     first, second = table["methods"][1].split(" and ")
     cards = {card["method"]: card for card in texts.cards(one)}
     assert cards[first]["state"] == cards[second]["state"] == cards["fused"]["state"] == "differs"
@@ -243,7 +243,10 @@ def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
 def test_an_accelerometer_without_gyros_is_not_called_absent(rocket: Path, run) -> None:
     """A deceleration carries the flight, and no force stands in body axes."""
     without = read_run(rocket)
-    sensed = replace(without, telemetry=replace(without.telemetry, accelerometer=run.telemetry.accelerometer))
+    sensed = replace(
+        without,
+        given=replace(without.flight, telemetry=replace(without.telemetry, accelerometer=run.telemetry.accelerometer)),
+    )
     rows = trajectory_rows(without)
     one, other = (
         {name: why for name, _, why in trajectory_panels(flown, rows)[1] if name in ("axial", "lateral")}
@@ -257,7 +260,7 @@ def test_run_of_the_trajectory_alone(run) -> None:
     bare = {**run.summary, "methods": {}, "agreement": None, "southwell": None}
     tables = {k: v for k, v in run.tables.items() if not k.startswith(("deflection", "fusion", "rigid", "camera"))}
     facts = {**run.facts, "settings": {**run.facts["settings"], "methods": []}}
-    one = type(run)(**{**vars(run), "summary": bare, "tables": tables, "facts": facts})
+    one = replace(run, summary=bare, tables=tables, facts=facts)
     text = page(one)
     assert "°" not in texts.title(one)
     assert {card["reason"] for card in texts.cards(one)} == {texts.NOT_ASKED}
@@ -267,7 +270,7 @@ def test_run_of_the_trajectory_alone(run) -> None:
 def test_failed_checks_and_findings_are_shown(run) -> None:
     bad = {**run.summary, "verdicts_failed": ["NIS north: too large <b>"], "suspects": ["north: its <i> time bias"]}
     found = pd.DataFrame([("north", "gap of 3 s", 430.0, 433.0)] * 300, columns=["source", "what", "start_s", "end_s"])
-    one = type(run)(**{**vars(run), "summary": bad, "tables": run.tables | {"findings": found}})
+    one = replace(run, summary=bad, tables=run.tables | {"findings": found})
     text = page(one)
     assert "✕ NIS north: too large &lt;b&gt;" in text
     assert ": north: its &lt;i&gt; time bias" in text
@@ -278,7 +281,7 @@ def test_failed_checks_and_findings_are_shown(run) -> None:
 def test_failed_checks_are_in_the_title_the_first_sentence_and_on_the_fused_card(run) -> None:
     checks = run.tables["consistency_checks"]
     red = checks.assign(passed=~checks["name"].isin(checks["name"].iloc[:2]))
-    one = type(run)(**{**vars(run), "tables": run.tables | {"consistency_checks": red}})
+    one = replace(run, tables=run.tables | {"consistency_checks": red})
     failed = red.loc[~red["passed"], "name"]
     words = doubt(list(failed), len(red))
     assert all(name.partition(":")[0] in words for name in failed)
@@ -317,7 +320,7 @@ def test_changed_telemetry_is_refused(rocket: Path, tmp_path: Path) -> None:
     path = tmp_path / "flight" / "flight.toml"
     path.write_text(path.read_text() + "\n# another thought\n")
     with pytest.raises(GateError) as refusal:
-        read_run(tmp_path / "flight")
+        _ = read_run(tmp_path / "flight").flight
     assert refusal.value.codes == ("inputs-changed",)
     assert "flight.toml" in str(refusal.value)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from postflight.report.notebook import write_notebook
-from postflight.report.source import read_run
+from postflight.runs import read_run
 from tests.postflight.report.conftest import HOSTILE
 from tests.refusing import numbers_in
 

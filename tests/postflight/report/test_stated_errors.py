@@ -13,7 +13,7 @@ import pytest
 
 from flightmodel.flightfolder import read_flight
 from postflight.report import write
-from postflight.report.source import read_run
+from postflight.runs import read_run
 from tests.in_process import runner
 from tests.refusing import printed_codes
 

@@ -1,0 +1,138 @@
+"""From what is a figure drawn? From a reconstruction, a run, loads or answers, as a notebook has them at hand.
+
+Each figure asks here for the part that it draws. What has no such part is refused, with what to pass instead.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from estimators.fusing import FusedAnswer
+from estimators.loads import FlightLoads, lateral_and_size
+from flightmodel.airdata import AirData
+from flightmodel.checks import FloatArray, GateError
+from flightmodel.deflection import DeflectionHistory
+from flightmodel.telemetry import Telemetry
+from postflight.deflections import Deflections
+from postflight.filming import by_camera, keep_oriented
+from postflight.flight import NO_VIDEO, RECONSTRUCT, Flight
+from postflight.plots.style import flight_words
+from postflight.reconstruction import Reconstruction
+from postflight.runs import Run
+
+Drawable = Reconstruction | Run | FlightLoads | Deflections
+RUN, FUSE, LOADS = "pf.read_run(folder)", "pf.fuse(bet)", "pf.read_loads(table, vehicle)"
+
+
+class Flow(NamedTuple):
+    """Air data of a table of loads, by the names that `AirData` has: times s, angles rad, pressure Pa, each (n,)."""
+
+    time_s: FloatArray
+    alpha_total_wind_rad: FloatArray
+    alpha_total_wind_sd_rad: FloatArray
+    dynamic_pressure_pa: FloatArray
+
+
+def lacking(figure: str, given: object, part: str, *wanted: str) -> GateError:
+    """Refusal of something that has not what a figure draws."""
+    return GateError(f"{figure}: {type(given).__name__} has no {part}; pass {' or '.join(wanted)}", "argument-type")
+
+
+def source_of(given: object) -> object:
+    """What deflections were made from, trajectory or loads; anything else is its own source."""
+    if isinstance(given, Deflections):
+        return given.loads if given.bet is None else given.bet
+    return given
+
+
+def bet_of(figure: str, given: object) -> Reconstruction | Run:
+    """Trajectory, and what it was made from; `GateError` where there is none."""
+    bet = source_of(given)
+    if isinstance(bet, Reconstruction | Run):
+        return bet
+    raise lacking(figure, given, "trajectory", RECONSTRUCT, RUN)
+
+
+def reconstruction_of(figure: str, given: object, part: str) -> Reconstruction:
+    """Reconstruction as it was computed, which alone has a part; `GateError` where there is none."""
+    bet = source_of(given)
+    if isinstance(bet, Reconstruction):
+        return bet
+    raise lacking(figure, given, part, RECONSTRUCT)
+
+
+def loads_of(figure: str, given: object) -> FlightLoads:
+    """Motion and flow at the c.g.; `GateError` where there are none."""
+    source = source_of(given)
+    if isinstance(source, FlightLoads):
+        return source
+    if isinstance(source, Reconstruction | Run):
+        return source.required_loads()
+    raise lacking(figure, given, "loads", RECONSTRUCT, RUN, LOADS)
+
+
+def flow_of(figure: str, given: object) -> AirData | Flow:
+    """Air data along the trajectory, or of loads; `GateError` where there are none."""
+    source = source_of(given)
+    if isinstance(source, Reconstruction | Run):
+        return source.air
+    loads = loads_of(figure, given)
+    towards, size = lateral_and_size(loads.flow_yz_rad)
+    sd = np.sqrt(np.einsum("ni,nij,nj->n", towards, loads.flow_cov, towards))
+    return Flow(loads.time_s, size, sd, loads.dynamic_pressure_pa)
+
+
+def answers_of(figure: str, given: object) -> Deflections:
+    """Deflections by method; `GateError` where there are none."""
+    if isinstance(given, Deflections):
+        return given
+    if isinstance(given, Run):
+        return given.deflections
+    raise lacking(figure, given, "deflection", FUSE, RUN)
+
+
+def history_of(figure: str, given: object, method: str) -> DeflectionHistory:
+    """Deflection by one method; `GateError` with the reason where there is none."""
+    try:
+        return answers_of(figure, given)[method]
+    except KeyError as fault:
+        raise GateError(f"{figure}: {fault.args[0]}", "input-missing") from None
+
+
+def fused_of(figure: str, given: object) -> FusedAnswer:
+    """Posterior behind the fused answer; `GateError` where there is none."""
+    answers = given if isinstance(given, Deflections) else Deflections()
+    if answers.fused is None:
+        raise lacking(figure, given, "posterior of the fusion, which no run stores", FUSE)
+    return answers.fused
+
+
+def film_of(
+    figure: str, flown: object, history: DeflectionHistory | None, camera: str | None
+) -> tuple[Telemetry, DeflectionHistory]:
+    """Telemetry with one camera, and its deflection at every frame (NaN where it has no answer).
+
+    The deflection is the camera's of the answers where no ``history`` is given, the camera the first where none is
+    named; `GateError` where there is no film or no answer.
+    """
+    flight = flown if isinstance(flown, Flight) else bet_of(figure, flown).flight
+    if isinstance(flown, Deflections) and flown.camera is not None:
+        keep_oriented(flight.telemetry, flown.camera.oriented)
+    seen = by_camera(flight.telemetry, history or history_of(figure, flown, "camera"))
+    name = next(iter(seen), None) if camera is None else camera
+    if name not in seen:
+        raise GateError(f"{figure}: no answer of a camera {name or ''}; cameras: {', '.join(seen)}", NO_VIDEO)
+    return seen[name]
+
+
+def words_of(given: object) -> str:
+    """Words for a figure's corner: the flight, whether it is synthetic, and what a what-if assumes."""
+    source = source_of(given)
+    if isinstance(source, Run):
+        return flight_words(source.header["flight"], bool(source.header["synthetic"]), source.changes)
+    if isinstance(source, Reconstruction | Flight):
+        flight = source if isinstance(source, Flight) else source.flight
+        return flight_words(flight.name, flight.telemetry.synthetic, flight.changes)
+    return f"{source.vehicle.name}: loads of a table" if isinstance(source, FlightLoads) else ""
