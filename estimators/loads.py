@@ -274,14 +274,14 @@ def loads_from_arrays(
     flow_sd = alone if stated.flow_sd_rad is None else at(stated.flow_sd_rad)[:, 0]
     given, part = stated.dynamic_pressure_sd_pa, 0.01 * errors.dynamic_pressure_sd_percent
     pressure_sd = part * pressure if given is None else at(given)[:, 0]
-    force_root, rate_root = _sensor_roots(force, rate, errors)
+    force_root, rate_root, flow_root = _roots(force, rate, np.sqrt(np.maximum(flow_sd**2 - wind**2, 0.0)), errors)
     peak = int(np.argmax(pressure))
     return FlightLoads(
         time_s=t,
         specific_force_body_mps2=force + rotations.lever_arm_acceleration(rate, turn, arm),
         force_noise_sd_mps2=noise / np.sqrt(samples),
         force_root_mps2=force_root,
-        flow_root_rad=np.zeros((len(t), 2, force_root.shape[2])),
+        flow_root_rad=flow_root,
         rate_root_radps=rate_root,
         rate_body_radps=rate,
         angular_acceleration_body_radps2=turn,
@@ -330,13 +330,22 @@ def _on_grid(stated: LoadsColumns) -> tuple[FloatArray, float, FloatArray, Float
     return at, h, mean(0, at - h, at + h), mean(1, at - h, at + h), turn
 
 
-def _sensor_roots(force: FloatArray, rate: FloatArray, errors: LoadsErrors) -> tuple[FloatArray, FloatArray]:
-    """Errors of force and rate (n, 3, 15) per unit normal: accelerometer's bias, scale, mount; gyros' bias, scale."""
+def _roots(
+    force: FloatArray, rate: FloatArray, angle_sd: FloatArray, errors: LoadsErrors
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Errors of force and rate (n, 3, 17) and flow (n, 2, 17) per unit normal.
+
+    Bias, scale and mount of the accelerometer, bias and scale of the gyros, and of the flow's angle, whose sd without
+    the wind is ``angle_sd`` (n,), what turns with the body: the mount of an inertial platform, an air data probe. No
+    table states how much of the error does: half of the variance here, and the rest is the attitude's, which keeps its
+    direction in space.
+    """
     axes, n = np.eye(3), len(force)
-    force_root, rate_root = np.zeros((n, 3, 15)), np.zeros((n, 3, 15))
+    force_root, rate_root, flow_root = (np.zeros((n, k, 17)) for k in (3, 3, 2))
     force_root[:, :, 0:3] = errors.accelerometer_bias_sd_mps2 * axes
     force_root[:, :, 3:6] = errors.accelerometer_scale_sd * force[:, :, None] * axes
     force_root[:, :, 6:9] = np.deg2rad(errors.accelerometer_mount_sd_deg) * rotations.skew(force)
     rate_root[:, :, 9:12] = np.deg2rad(errors.rate_bias_sd_degps) * axes
     rate_root[:, :, 12:15] = errors.rate_scale_sd * rate[:, :, None] * axes
-    return force_root, rate_root
+    flow_root[:, :, 15:17] = np.sqrt(0.5) * angle_sd[:, None, None] * np.eye(2)
+    return force_root, rate_root, flow_root

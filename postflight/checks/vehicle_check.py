@@ -2,7 +2,7 @@
 
 Numbers that an engineer knows by heart and a wrong sign or unit spoils: mass and c.g., ballistic coefficient ``m / (C_A
 S)``, centre of pressure and static margin at small angles, free-free frequency of the joint, and from the static model
-of `synthetic_flight.linear` the dynamic pressure at which the joint diverges and the trim at a stated one::
+of `flightmodel.linear` the dynamic pressure at which the joint diverges and the trim at a stated one::
 
     x_cp = -C_ma l / C_Na,   static margin = x_cp - x_cg,   q_crit = K / (S C_A xbar (1 + xbar / margin))
 
@@ -33,12 +33,12 @@ import pandas as pd
 
 from flightmodel.checks import FloatArray, Issue, check_type
 from flightmodel.geometry import aft_profile, forward_profile
+from flightmodel.linear import Slopes, critical_stiffness_nmprad, levers, slopes_at, static_trim
 from flightmodel.tabular import Tabular
 from flightmodel.vehicle import Vehicle, shipped
 from flightmodel.vehicle import read_vehicle as read_file
 from postflight.streams import write_out
 from postflight.terminal import EXIT_CHECK_FAILED, terminal
-from synthetic_flight.linear import Slopes, critical_stiffness_nmprad, levers, slopes_at, static_trim
 
 console = terminal()
 

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flightmodel.checks import FloatArray
+from flightmodel.checks import FloatArray, check_type
 from flightmodel.deflection import lv_direction
 from flightmodel.geometry import forward_profile, torus_circles
+from flightmodel.linear import levers, slopes_at
 from flightmodel.vehicle import Vehicle
-from postflight.plots.style import COLOUR, in_style, legend_above, titled
-from synthetic_flight.linear import levers, slopes_at
+from postflight.plots.style import COLOUR, in_style, titled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,8 @@ def figure_vehicle(vehicle: Vehicle, mach: float | None = None) -> Figure:
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 5.0))
+    check_type("figure_vehicle", vehicle, Vehicle, "pf.read_vehicle(file)")
+    figure = Figure(figsize=(7.0, 5.0), layout="constrained")
     ax = figure.subplots()
     _bodies(ax, vehicle)
     at = float(vehicle.aero.mach[-1]) if mach is None else mach
@@ -52,7 +53,7 @@ def figure_vehicle(vehicle: Vehicle, mach: float | None = None) -> Figure:
     _cameras(ax, vehicle)
     ax.axhline(0.0, color=COLOUR["zero"], lw=0.6, ls="-.", zorder=0)
     ax.set(aspect="equal", xlabel="station aft of the nose (m)", ylabel="towards 0 deg LV (m)")
-    legend_above(ax, 3)
+    ax.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
     return titled(figure, f"{vehicle.name}, {vehicle.mass_kg:.4g} kg", "undeflected, to scale; flow from the left")
 
 

@@ -40,6 +40,7 @@ from typing import Any
 import numpy as np
 
 from flightmodel.checks import DivergenceError, FloatArray, GateError, Progress, part_of
+from flightmodel.linear import critical_stiffness_nmprad, slopes_at
 from flightmodel.trajectory import resample
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import (
@@ -68,7 +69,6 @@ from postflight.reconciliation.gauss_newton import (
 )
 from postflight.reconciliation.normal_equations import NormalEquations
 from postflight.reconstruction import Reconstruction
-from synthetic_flight.linear import critical_stiffness_nmprad, slopes_at
 
 Correction = Callable[[Problem, Parameters], Parameters]
 SD_FACTORS_EARLY = (30.0, 10.0, 3.0)

@@ -2,7 +2,7 @@
 
 Of the fit it takes only where to look, within a factor of two of its stiffness. Lateral rates and specific force,
 rotated into axes that do not spin, are cut into overlapping windows. The logarithm of their spectra over the noise is
-averaged along the frequency ``f(K; q, Mach, V)`` that the linear model (`synthetic_flight.linear`) predicts for the
+averaged along the frequency ``f(K; q, Mach, V)`` that the linear model (`flightmodel.linear`) predicts for the
 joint's mode in every window, for both senses of rotation. The stiffness ``K`` with the largest mean is the estimate.
 Start, damping, offset and wind take no part; the uncertainty of masses, stations, inertias and coefficients is
 propagated by differences.
@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError
+from flightmodel.linear import linear_matrix, modes, slopes_at
 from flightmodel.statistics import jackknife_variance
 from flightmodel.vehicle import Vehicle
 from postflight.reconciliation.forward_model import STIFFNESS_LOG_SD, VehicleParameters
 from postflight.reconstruction import Reconstruction
-from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
 RATE_HZ = 50.0  # ten samples a period of the joint at 5 Hz
 WINDOW, HOP, PADDED = 256, 32, 2048  # 5 s resolve 0.2 Hz; a hop of 0.6 s follows the pressure; padded to 0.02 Hz

@@ -28,8 +28,8 @@ from estimators.trim import SLOPE_AT_RAD, estimate_trim, static_trim, trim_curva
 from flightmodel import rotations
 from flightmodel.airdata import lateral_angles
 from flightmodel.deflection import history_from_lateral
+from flightmodel.linear import Slopes, linear_matrix
 from flightmodel.statistics import correlation
-from synthetic_flight.linear import Slopes, linear_matrix
 
 from .conftest import VEHICLE, pulse_of
 

@@ -3,7 +3,7 @@
 Run: ``python -m tests.oracles.axdahl_zones [PICTURE]`` (half a minute); without a name it draws
 ``docs/images/axdahl_zones.png``.
 
-Axdahl's stability map twice: from eigenvalues (`synthetic_flight.linear`) and from flights of the nonlinear simulator.
+Axdahl's stability map twice: from eigenvalues (`flightmodel.linear`) and from flights of the nonlinear simulator.
 The flights need constant speed and dynamic pressure although the vehicle decelerates. They get them by falling at
 terminal speed through air of constant density: gravity then acts on each body as deceleration does, ``g = q S C_A /
 m``, so the linear equations hold unchanged. On Earth that fixes ``q_E = m g / (S C_A)``; a flight at dynamic pressure
@@ -34,9 +34,7 @@ from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import AtmosphereProfile, us76
 from flightmodel.checks import FloatArray
-from flightmodel.vehicle import MassProperties, Vehicle, vehicle_from_toml, vehicle_path
-from synthetic_flight import simulate
-from synthetic_flight.linear import (
+from flightmodel.linear import (
     DIVERGENT,
     STABLE,
     UNSTABLE,
@@ -45,6 +43,8 @@ from synthetic_flight.linear import (
     linear_matrix,
     modes,
 )
+from flightmodel.vehicle import MassProperties, Vehicle, vehicle_from_toml, vehicle_path
+from synthetic_flight import simulate
 from synthetic_flight.simulate import integrate
 
 # the reference vehicle at Mach 3.2 with 0.7 of the Newtonian static stability, C_mq constant and destabilising

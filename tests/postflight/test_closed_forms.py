@@ -13,6 +13,7 @@ from flightmodel.airdata import Inputs, _path_angles, derived, lateral_angles
 from flightmodel.atmosphere import standard_atmosphere, standard_sounding
 from flightmodel.earth import undulation_m
 from flightmodel.instruments import TriadSpec
+from flightmodel.linear import linear_matrix, modes, slopes_at
 from flightmodel.trajectory import Trajectory
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight import reconstruction
@@ -29,7 +30,6 @@ from postflight.runs import STATE_COLUMNS
 from postflight.scoring import _bet_errors, _method_row
 from postflight.studies import preflight
 from recon import atmosphere
-from synthetic_flight.linear import linear_matrix, modes, slopes_at
 
 G0 = 9.80665
 

@@ -135,6 +135,14 @@ def test_defaults_widen_the_answer_and_keys_replace_them(alien):
         read_loads(alien, "irve2_reference", flow_angle_deg=1.0)
 
 
+def test_half_of_the_flow_angles_variance_turns_with_the_body(alien):
+    loads = read_loads(alien, "irve2_reference", flow_angle_sd_deg=0.4)
+    turning = np.einsum("nik,njk->nij", loads.flow_root_rad, loads.flow_root_rad)
+    np.testing.assert_allclose(turning, np.tile(0.5 * np.deg2rad(0.4) ** 2 * np.eye(2), (len(turning), 1, 1)))
+    total = np.deg2rad(0.4) ** 2 + loads.wind_flow_sd_rad**2
+    np.testing.assert_allclose(loads.flow_cov, total[:, None, None] * np.eye(2), rtol=1e-9, atol=1e-15)
+
+
 def test_fusion_takes_loads(alien, run):
     loads = read_loads(alien, "irve2_reference")
     answer = pf.fuse(loads)

@@ -8,7 +8,7 @@ moderate stiffness and damping; oscillating ever wider at high stiffness where C
 import numpy as np
 import pytest
 
-from synthetic_flight.linear import DIVERGENT, STABLE, UNSTABLE
+from flightmodel.linear import DIVERGENT, STABLE, UNSTABLE
 from tests.oracles import axdahl_zones
 from tests.oracles.axdahl_zones import JointGrid
 

@@ -14,10 +14,10 @@ from scipy.linalg import expm
 
 from flightmodel import earth, rotations
 from flightmodel.checks import ConfigError
+from flightmodel.linear import Slopes, linear_matrix, modes, static_trim
 from flightmodel.vehicle import CompliantJoint
 from synthetic_flight import dynamics, simulate
 from synthetic_flight.ensemble import Start, fly_ensemble
-from synthetic_flight.linear import Slopes, linear_matrix, modes, static_trim
 from synthetic_flight.simulate import Schedule, integrate
 from tests.oracles import two_body
 

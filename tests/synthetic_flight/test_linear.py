@@ -12,9 +12,7 @@ import pytest
 from scipy.optimize import fsolve
 
 from flightmodel import rotations
-from flightmodel.vehicle import AeroTerms
-from synthetic_flight import dynamics
-from synthetic_flight.linear import (
+from flightmodel.linear import (
     DIVERGENT,
     STABLE,
     UNSTABLE,
@@ -25,6 +23,8 @@ from synthetic_flight.linear import (
     slopes_at,
     static_trim,
 )
+from flightmodel.vehicle import AeroTerms
+from synthetic_flight import dynamics
 from tests.oracles import two_body
 
 from .newtonian import METACENTRE_M, FrozenAir, linear_table, newtonian, r1, table

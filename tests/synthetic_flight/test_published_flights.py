@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import norm
 
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.linear import slopes_at
 from synthetic_flight.folder import flight_events
-from synthetic_flight.linear import slopes_at
 from synthetic_flight.scenarios import fly_scenario, read_scenario
 
 FIGURES = {

@@ -43,6 +43,7 @@ DRAWN = {
     "figure_sensitivity": {"bet", "answer"},
     "figure_summary": ANSWERS | {"loads_answer"},
     "figure_table_3_1": set(),
+    "figure_vehicle": set(),
 }
 
 
