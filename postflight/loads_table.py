@@ -55,7 +55,16 @@ _SCALARS = {
     "clock": _Meaning("angle", ("clocklv", "clock", "clockangle", "clockingangle")),
     "alpha": _Meaning("angle", ("alpha", "aoa", "angleofattack")),
     "beta": _Meaning("angle", ("beta", "sideslip", "aos", "angleofsideslip")),
+    "v_north": _Meaning("speed", ("vnorth", "vn", "northvelocity", "velocitynorth", "velnorth", "veln")),
+    "v_east": _Meaning("speed", ("veast", "ve", "eastvelocity", "velocityeast", "veleast", "vele")),
+    "v_down": _Meaning("speed", ("vdown", "vd", "downvelocity", "velocitydown", "veldown", "veld")),
+    "wind_north": _Meaning("speed", ("windnorth", "northwind", "windn", "vwindnorth", "vwn")),
+    "wind_east": _Meaning("speed", ("windeast", "eastwind", "winde", "vwindeast", "vwe")),
+    "yaw": _Meaning("angle", ("yaw", "psi", "heading")),
+    "pitch": _Meaning("angle", ("pitch", "theta")),
+    "roll": _Meaning("angle", ("roll", "phi", "bank")),
 }
+_MOTION = ("v_north", "v_east", "v_down", "wind_north", "wind_east", "yaw", "pitch", "roll")
 _WITH_SD = ("dynamic_pressure", "alpha", "beta", "alpha_total")
 # columns of this program's own bet.csv that the recognition by words would not choose among several
 _OWN = {
@@ -110,7 +119,9 @@ def read_loads(
     table : path or DataFrame
         CSV in any layout, or another format that ``postflight import`` reads. It holds a time, the specific force
         (``ax, ay, az``), rates (``p, q, r``), an altitude, two of Mach number, dynamic pressure and airspeed, and the
-        flow: ``alpha`` and ``beta``, or ``alpha_total`` and ``clock`` (LV clocking angle).
+        flow: ``alpha`` and ``beta``, or ``alpha_total`` and ``clock`` (LV clocking angle), or the velocity relative to
+        the ground ``v_north, v_east, v_down``, the attitude ``yaw, pitch, roll`` (Euler angles 3-2-1 from north, east,
+        down) and the air's own velocity ``wind_north, wind_east``, which also give the airspeed.
     vehicle : path, str or Vehicle
         Vehicle file, or the name of a shipped vehicle.
     columns : mapping of str to str, optional
@@ -265,7 +276,7 @@ def _read_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: _Co
     for word in meaning.words:
         for k in fitting:
             named = recogniser.named[k]
-            if _stem(named) != word or (named.kinds and meaning.kind not in named.kinds):
+            if _stem(named, short) != word or (named.kinds and meaning.kind not in named.kinds):
                 continue
             values = table.numbers(k)
             units = named.units(meaning.kind) or (["1"] if meaning.kind == "fraction" and not named.kinds else [])
@@ -279,9 +290,10 @@ def _read_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: _Co
             return
 
 
-def _stem(named: ColumnName) -> str:
+def _stem(named: ColumnName, short: str) -> str:
     """Words of a name in one, without those that say whose it is or that it is a standard deviation."""
-    return "".join(token for token in named.tokens if token not in ("sd", "sigma", "std", "wind", "deg", "body", "cg"))
+    said = {"sd", "sigma", "std", "deg", "body", "cg"} | (set() if short.startswith("wind") else {"wind"})
+    return "".join(token for token in named.tokens if token not in said)
 
 
 def _is_sd(named: ColumnName) -> bool:
@@ -294,10 +306,14 @@ def _is_sd(named: ColumnName) -> bool:
 def _columns(found: _Columns) -> LoadsColumns:
     """Columns as the loads need them; `GateError` with everything that is missing."""
     faults, values = found.faults, found.values
-    flow = "alpha and beta" if not found.has("alpha_total") else "clock"
     there = found.open | set(values)
+    moving = {"v_north", "yaw"} <= there
+    flow = "clock" if "alpha_total" in there else ", ".join(m for m in _MOTION if m not in there)
+    flow = flow if moving or "alpha_total" in there else "alpha and beta"
+    if set(_MOTION) <= there:
+        there.add("airspeed")
     missing = [name for name in ("t", *_FORCE, *_RATES, "altitude") if name not in there]
-    if not ({"alpha", "beta"} <= there or {"alpha_total", "clock"} <= there):
+    if not any(set(names) <= there for names in (("alpha", "beta"), ("alpha_total", "clock"), _MOTION)):
         missing.append(flow)
     if len({"mach", "dynamic_pressure", "airspeed"} & there) < 2:
         missing.append("two of mach, dynamic_pressure and airspeed")
@@ -306,14 +322,15 @@ def _columns(found: _Columns) -> LoadsColumns:
         faults.append(Issue(words, "column-missing"))
     if faults:
         raise GateError(faults)
-    _complete(values)
+    velocity = _velocity_air_body(values)
+    _complete(values, velocity)
     rows = np.isfinite(np.column_stack([v for k, v in values.items() if not k.endswith("_sd")])).all(axis=1)
     at = {name: column[rows] for name, column in values.items()}
     return LoadsColumns(
         time_s=at["t"],
         specific_force_body_mps2=np.column_stack([at[name] for name in _FORCE]),
         rate_body_radps=np.column_stack([at[name] for name in _RATES]),
-        flow_yz_rad=_flow(at),
+        flow_yz_rad=_flow(at, None if velocity is None else velocity[rows]),
         mach=at["mach"],
         dynamic_pressure_pa=at["dynamic_pressure"],
         airspeed_mps=at["airspeed"],
@@ -324,8 +341,24 @@ def _columns(found: _Columns) -> LoadsColumns:
     )
 
 
-def _complete(values: dict[str, FloatArray]) -> None:
+def _velocity_air_body(values: dict[str, FloatArray]) -> FloatArray | None:
+    """Velocity relative to the air (n, 3), body axes, by velocity, wind and attitude; None where one is missing."""
+    from scipy.spatial.transform import Rotation  # for the tables that state it
+
+    if not set(_MOTION) <= set(values):
+        return None
+    v_north, v_east, v_down, wind_north, wind_east, *turns = (values[name] for name in _MOTION)
+    known = np.isfinite(turns).all(axis=0)
+    velocity = np.full((len(v_down), 3), np.nan)
+    to_ned = Rotation.from_euler("ZYX", np.column_stack(turns)[known])
+    velocity[known] = to_ned.inv().apply(np.column_stack([v_north - wind_north, v_east - wind_east, v_down])[known])
+    return velocity
+
+
+def _complete(values: dict[str, FloatArray], velocity: FloatArray | None) -> None:
     """Add the third of Mach number, dynamic pressure and airspeed by the standard atmosphere."""
+    if velocity is not None:
+        values.setdefault("airspeed", np.linalg.norm(velocity, axis=1))
     density, temperature, _ = us76(np.clip(values["altitude"], 0.0, 150e3))
     sound = sound_speed(values["altitude"], temperature)
     if "airspeed" not in values:
@@ -334,11 +367,14 @@ def _complete(values: dict[str, FloatArray]) -> None:
     values.setdefault("dynamic_pressure", 0.5 * density * values["airspeed"] ** 2)
 
 
-def _flow(at: dict[str, FloatArray]) -> FloatArray:
-    """Total angle of attack as a lateral vector (n, 2), rad."""
+def _flow(at: dict[str, FloatArray], velocity: FloatArray | None) -> FloatArray:
+    """Total angle of attack as a lateral vector (n, 2), rad; by the velocity (n, 3) where no angles are stated."""
     if "alpha" in at and "beta" in at:
         ca, cb = np.cos(at["alpha"]), np.cos(at["beta"])
         velocity = np.column_stack([ca * cb, np.sin(at["beta"]), np.sin(at["alpha"]) * cb])
+        return lateral_angles(velocity)
+    if not {"alpha_total", "clock"} <= set(at):
+        assert velocity is not None
         return lateral_angles(velocity)
     return np.asarray(at["alpha_total"][:, None] * lv_direction(at["clock"])[:, 1:])
 

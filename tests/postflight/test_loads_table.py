@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 import postflight as pf
+from flightmodel import earth
 from flightmodel.airdata import pressure_pulse
 from flightmodel.vehicle import read_vehicle
 from postflight import commands
@@ -14,7 +15,7 @@ from postflight.loads_table import read_loads
 from tests.postflight.short_flights import write_pulse
 from tests.refusing import refuses
 
-FOOT, PSF, G = 0.3048, 47.88026, 9.80665
+FOOT, PSF, G, KNOT = 0.3048, 47.88026, 9.80665, 1852.0 / 3600.0
 METHODS = ("misalignment", "trim")
 
 
@@ -77,6 +78,23 @@ def test_angles_by_total_and_clock_are_those_by_alpha_and_beta(alien, bet, run):
     other["TOTAL ALPHA (deg)"], other["CLOCK (deg)"] = bet.alpha_total_wind_deg, bet.clock_lv_deg
     flow = read_loads(other, "irve2_reference").flow_yz_rad
     np.testing.assert_allclose(flow, read_loads(alien, "irve2_reference").flow_yz_rad, atol=1e-7)
+
+
+def test_flow_by_velocity_wind_and_attitude_is_that_by_alpha_and_beta(alien, bet, run):
+    other = alien.drop(columns=["ALPHA (deg)", "BETA (deg)", "VTAS (ft/s)"])
+    to_ned = earth.dcm_ned_ecef(np.deg2rad(bet.lat_deg.to_numpy()), np.deg2rad(bet.lon_deg.to_numpy()))
+    velocity = np.einsum("nij,nj->ni", to_ned, bet[["vx_ecef_mps", "vy_ecef_mps", "vz_ecef_mps"]])
+    other[["V_NORTH (m/s)", "V_EAST (m/s)", "V_DOWN (m/s)"]] = velocity
+    other[["YAW (deg)", "PITCH (deg)", "ROLL (deg)"]] = bet[["yaw_ned_deg", "pitch_ned_deg", "roll_ned_deg"]]
+    with refuses("column-missing", names=["wind_north, wind_east"]):
+        read_loads(other, "irve2_reference")
+    other["WIND NORTH (kt)"], other["WIND EAST (kt)"] = bet.wind_n_mps / KNOT, bet.wind_e_mps / KNOT
+    loads, by_angles = (read_loads(each, "irve2_reference") for each in (other, alien))
+    # the velocity is the datum's, about which the c.g. swings; 1e-6 is of what is written
+    swing = np.linalg.norm(np.cross(loads.rate_body_radps, loads.vehicle.cg_m), axis=1) / loads.airspeed_mps
+    away = np.linalg.norm(loads.flow_yz_rad - by_angles.flow_yz_rad, axis=1)
+    assert (away < 1.001 * swing + 1e-5).all()
+    assert (np.abs(loads.airspeed_mps / by_angles.airspeed_mps - 1.0) < swing + 1e-5).all()
 
 
 def test_units_that_the_header_leaves_open_are_asked_all_at_once_and_can_be_stated(alien):
