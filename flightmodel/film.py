@@ -93,6 +93,8 @@ class Frames:
         What an analyst decided by eye; places in pictures as they are given.
     filed_px : (2,) int or None
         Width and height of the pictures in their files, where they are reduced.
+    held : tuple of (h, w) uint8
+        Grey pictures in memory, which stand for files; empty where ``paths`` names these.
     """
 
     camera: CameraMount
@@ -104,6 +106,7 @@ class Frames:
     time_bias_sd_s: float = 0.0
     edits: CameraEdits = NO_EDITS
     filed_px: tuple[int, int] | None = None
+    held: tuple[Image, ...] = ()
 
     @property
     def benchmark(self) -> int:
@@ -119,7 +122,7 @@ class Frames:
         wanted = list(range(len(self.time_s))) if indices is None else indices
         if self.numbers is None:
             for k in wanted:
-                yield self._given(read_image(self.paths[k]))
+                yield self._given(self.held[k] if self.held else read_image(self.paths[k]))
             return
         yield from map(self._given, film_frames(self.paths[0], [int(self.numbers[k]) for k in wanted]))
 
@@ -134,6 +137,8 @@ class Frames:
         """Where the picture (h, w) is the same in every frame, as a time code is; None: nowhere."""
         chosen = np.unique(np.linspace(0, len(self.time_s) - 1, _SPREAD).round().astype(int))
         filed_px = self.filed_px or self.camera.size_px
+        if self.held:
+            return burnt_in([self._given(self.held[k]) for k in chosen])
         if self.numbers is None:
             # a folder is checked before all of it was found fit
             fit = [self.paths[k] for k in chosen if not image_fault(self.paths[k], filed_px)]
@@ -189,6 +194,17 @@ def film_frames(path: Path, numbers: list[int]) -> Iterator[Image]:
         film.release()
 
 
+def frame_times_ms(path: Path) -> list[float]:
+    """Time of every frame of a film that can be decoded, by its container, ms; the whole film is decoded."""
+    film, times = cv2.VideoCapture(str(path)), []
+    try:
+        while film.grab():
+            times.append(film.get(cv2.CAP_PROP_POS_MSEC))
+    finally:
+        film.release()
+    return times
+
+
 def _grey(picture: NDArray[np.uint8]) -> Image:
     if picture.ndim == 3:
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
@@ -202,16 +218,11 @@ def film_timing_fault(path: Path) -> Issue:
     gives it away is the file's own count of frames (WebM's is its length times its rate), or a jump in its times. The
     whole film is decoded.
     """
-    film = cv2.VideoCapture(str(path))
-    try:
-        counts = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
-        with path.open("rb") as file:
-            estimated = file.read(4) == WEBM_START
-        times = []
-        while film.grab():
-            times.append(film.get(cv2.CAP_PROP_POS_MSEC))
-    finally:
-        film.release()
+    film, times = cv2.VideoCapture(str(path)), frame_times_ms(path)
+    counts = round(film.get(cv2.CAP_PROP_FRAME_COUNT))
+    film.release()
+    with path.open("rb") as file:
+        estimated = file.read(4) == WEBM_START
     remedy = "numbers in the list may name later pictures; extract the frames as images, or check the list"
     if counts > 0 and not (len(times) >= counts - 1 if estimated else len(times) == counts):
         words = f"{len(times)} frames can be decoded where the film's own count is {counts}"

@@ -531,16 +531,16 @@ def read_frames(gate: Gate, source: FramesEntry, vehicle: Vehicle | None, label:
     edits = _edits(gate, label, source.camera, time_s, vehicle)
     benchmark_s = source.benchmark_s if edits.benchmark_s is None else edits.benchmark_s
     frames = Frames(camera, source.camera, time_s, paths, benchmark_s, numbers, source.time_bias_sd_s, edits)
-    return _reduced(gate, label, frames)
+    return reduced(gate.findings, label, frames)
 
 
-def _reduced(gate: Gate, label: str, frames: Frames) -> Frames:
+def reduced(findings: list[Issue], label: str, frames: Frames) -> Frames:
     """Frames with their pictures read smaller, and a finding, where the camera is finer than is needed."""
     filed_px, camera = frames.camera.size_px, working_camera(frames.camera)
     if camera.size_px == filed_px:
         return frames
     words = f"pictures of {filed_px[0]} x {filed_px[1]} pixels, read at {camera.width_px} x {camera.height_px}"
-    gate.findings.append(Issue(words, "frame-size", label))
+    findings.append(Issue(words, "frame-size", label))
     edits = frames.edits.resized(filed_px, camera.size_px)
     return replace(frames, camera=camera, edits=edits, filed_px=filed_px)
 

@@ -6,6 +6,7 @@
     bet = pf.reconstruct(flight)                # best-estimated trajectory, air data, consistency checks
     answer = pf.fuse(bet)                       # the deflection by every method, and fused
     answer = pf.fuse(pf.read_loads("bet.csv", "vehicle.toml"))  # the same on another team's trajectory
+    history = pf.estimate_camera(pf.read_film("pictures", "frames.csv", "vehicle.toml"))  # a film and no trajectory
     changed = flight.with_(c_n=1.1, wind=None)  # a what-if is a changed flight
     run = pf.read_run("my-flight")              # what `postflight run` left: run.trajectory, run.air, run.deflections
 
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
         estimate_trim,
         fuse,
     )
+    from postflight.film_alone import read_film
     from postflight.flight import Flight, read_flight
     from postflight.flown_coefficients import AeroIncrements
     from postflight.interface import check_flight, compare, monte_carlo, score, simulate, write_report
@@ -69,6 +71,7 @@ _DOOR = {
         "recon.settings": "Settings",
         "flightmodel.trajectory": "Trajectory",
         "postflight.loads_table": "read_loads",
+        "postflight.film_alone": "read_film",
         "postflight.runs": "read_run Run",
         "estimators.loads": "FlightLoads",
         "postflight.deflections": "Deflections aero_increments estimate_camera estimate_misalignment estimate_trim "
@@ -104,6 +107,7 @@ __all__ = [
     "fuse",
     "monte_carlo",
     "plots",
+    "read_film",
     "read_flight",
     "read_loads",
     "read_run",

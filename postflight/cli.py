@@ -30,6 +30,7 @@ from postflight.streams import close_streams, open_streams, pin_threads, write_o
 gc.set_threshold(50_000, 20, 100)
 atexit.register(gc.freeze)
 FOLDER = click.Path(path_type=Path)
+OVERLAY = "overlay"  # value of --film without one
 
 
 class Computing(click.Command):
@@ -317,27 +318,41 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 @click.option(
     "--joint", type=FiniteRange(0.0), help="Assume the joint this far aft of the nose, m; default: the vehicle file's."
 )
-@click.option("--film", is_flag=True, help="Also write the film with the virtual camera over it (VP9 WebM).")
+@click.option(
+    "--film", metavar="[PICTURES]", is_flag=False, flag_value=OVERLAY,
+    help="Instead of FOLDER: pictures in a folder, or a film. With FOLDER, without a value: also write its film with "
+    "the virtual camera over it (VP9 WebM).",
+)  # fmt: skip
+@click.option("--times", metavar="LIST|HZ", help="Of --film PICTURES: a list t_s, frame (CSV), or a frame rate.")
+@click.option("--camera", metavar="NAME", help="Of --film PICTURES: which camera, if the vehicle file has several.")
+@click.option("--benchmark", type=float, help="Of --film PICTURES: when the shell is at rest, s; default: the first.")
 @click.option("--loads", metavar="TABLE", help="Instead of FOLDER: another team's trajectory, accelerations and rates.")
-@click.option("--vehicle", metavar="FILE", help="Vehicle file, or the name of a shipped vehicle, for --loads.")
+@click.option("--vehicle", metavar="FILE", help="Vehicle file, or the name of a shipped one, for --loads and --film.")
 @click.option("--column", "columns", multiple=True, metavar="NAME=COLUMN[:UNIT]", help="Of --loads: ax='AX (g)'.")
 @click.option("--set", "errors", multiple=True, metavar="KEY=VALUE", help="Of --loads: flow_angle_sd_deg=0.5, ...")
 @click.option("--at", "place", default="cg", help="Of --loads: where the accelerometer is: cg, or a vehicle's package.")
 def deflection(
-    folder: Path | None, methods: tuple[str, ...], plane: float | None, joint: float | None, film: bool,
+    folder: Path | None, methods: tuple[str, ...], plane: float | None, joint: float | None, film: str | None,
+    times: str | None, camera: str | None, benchmark: float | None,
     loads: str | None, vehicle: str | None, columns: tuple[str, ...], errors: tuple[str, ...], place: str,
 ) -> None:  # fmt: skip
-    """Estimate how far the aeroshell deflected in the flight in FOLDER, or by a table of loads (--loads, --vehicle)."""
+    """Estimate how far the aeroshell deflected: in the flight in FOLDER, by a table of loads (--loads, --vehicle), or
+    by a film alone (--film, --times, --vehicle).
+    """
     from postflight import commands
 
-    if (folder is None) == (loads is None):
-        raise click.UsageError("name a flight folder, or --loads TABLE with --vehicle FILE")
+    alone = None if film == OVERLAY else film
+    stated = [folder, loads, alone].count(None) == 2 and (folder is not None or vehicle is not None)
+    if not stated or (alone is not None and times is None):
+        words = "name FOLDER, or --loads TABLE --vehicle FILE, or --film PICTURES --times LIST --vehicle FILE"
+        raise click.UsageError(f"{words}; to draw the overlay of a flight's film, write FOLDER --film")
     if folder is not None:
-        commands.deflection(folder, methods, plane, joint, film)
-    elif vehicle is None or loads is None:
-        raise click.UsageError("--loads wants --vehicle FILE: mass properties and coefficients")
+        commands.deflection(folder, methods, plane, joint, film == OVERLAY)
+    elif loads is not None:
+        commands.deflection_of_table(Path(loads), str(vehicle), methods, columns, errors, place)
     else:
-        commands.deflection_of_table(Path(loads), vehicle, methods, columns, errors, place)
+        changes = commands.assumed(plane, joint)
+        commands.deflection_of_film(Path(str(alone)), str(times), str(vehicle), camera, benchmark, changes)
 
 
 @cli.command()

@@ -23,12 +23,12 @@ from rich.table import Table
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from flightmodel.config import parse_section
-from flightmodel.files import write_file
 from flightmodel.vehicle import read_vehicle
 from postflight import run_folder, warmup
 from postflight.beside import Beside, Task, same
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
+from postflight.methods import Inputs
 from postflight.plots.style import FigureFolder
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.write import write_report
@@ -305,14 +305,10 @@ def _answered(
         camera = beside.submit("postflight.filming:answer_of_film", there, film)
         if "fused" in methods:
             time_bias = beside.submit("postflight.filming:time_bias_of", there, camera)
-    wanted = tuple(m for m in methods if m != "camera" or flight.telemetry.frames is not None)
-
     figures.draw("trajectory")  # which comes after the camera
     _ = bet.table  # while the camera has no answer yet
-    answers = estimate(bet, wanted, step(0.7, 1.0), camera, time_bias)
+    answers = estimate(bet, methods, step(0.7, 1.0), camera, time_bias)
     stages.end("deflections")
-    if "camera" in methods and "camera" not in wanted:
-        answers.refused["camera"] = Issue("the flight has no video", NO_VIDEO)
     return bet, answers
 
 
@@ -510,6 +506,12 @@ def print_answers(answers: Deflections) -> None:
         console.coded("[yellow]no answer[/]", f"from {', '.join(methods)}: {reason}", code)
 
 
+def assumed(plane_deg: float | None, joint_m: float | None) -> dict[str, Any]:
+    """Assumptions of the camera, as `Flight.with_` takes them, that are stated."""
+    given = {"camera_plane_lv_deg": plane_deg, "joint_station_m": joint_m}
+    return {name: value for name, value in given.items() if value is not None}
+
+
 def deflection(
     folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
 ) -> None:
@@ -518,12 +520,10 @@ def deflection(
     from postflight.plots.overlay import write_overlay_film
     from postflight.plots.run_figures import draw_camera
 
-    assumed = {"camera_plane_lv_deg": plane_deg, "joint_station_m": joint_m}
-    flight = read_flight(folder, needs_path=set(methods) != {"camera"})
-    flight = flight.with_(**{name: value for name, value in assumed.items() if value is not None})
+    flight = read_flight(folder, needs_path=set(methods) != {"camera"}).with_(**assumed(plane_deg, joint_m))
     telemetry = flight.telemetry
     if not methods:
-        methods = tuple(m for m in METHODS if m != "camera" or telemetry.frames is not None)
+        methods = tuple(m for m in METHODS if m != "camera" or m not in Inputs.of(telemetry).missing())
     settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
     alone = set(methods) == {"camera"}
     makes_bet = not alone or (plane_deg is None and telemetry.can_tell_load)
@@ -570,7 +570,7 @@ def deflection(
 def deflection_of_table(
     table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], errors: tuple[str, ...], place: str
 ) -> None:
-    """Estimate, print, and write a table a method beside the table of loads, in ``<stem>-deflection``."""
+    """Estimate by loads, print, and write tables and figures beside them, in ``<stem>-deflection``."""
     from estimators.loads import LoadsErrors
     from postflight.loads_table import loads_and_unused
 
@@ -580,17 +580,49 @@ def deflection_of_table(
     loads, unused = loads_and_unused(table, made, pairs, place, stated)
     compile_kernels("balance")
     answers = estimate(loads, methods or tuple(name for name in METHODS if name != "camera"))
-    folder = table.with_name(f"{table.stem}-deflection")
-    folder.mkdir(exist_ok=True)
-    for method, history in answers.histories.items():
-        content = history.to_frame().to_csv(index=False, float_format=run_folder.DIGITS, lineterminator="\n")
-        write_file(folder / f"deflection_{method}.csv", content)
-    print_answers(answers)
     defaults = (f"{key} = {size}" for key, size in LoadsErrors().model_dump().items() if key not in changes and size)
-    console.print(f"{len(loads.time_s)} rows of {table}; errors not stated there: {', '.join(defaults)}", markup=False)
-    if unused:
-        console.print(f"columns not used: {', '.join(unused)}", markup=False)
-    console.print(f"tables in {folder}", markup=False)
+    words = [f"{len(loads.time_s)} rows of {table}; errors not stated there: {', '.join(defaults)}"]
+    _finish_alone(table, answers, [*words, *([f"columns not used: {', '.join(unused)}"] if unused else [])])
+
+
+def deflection_of_film(
+    pictures: Path, times: str, vehicle: str, camera: str | None, benchmark_s: float | None, changes: dict[str, Any]
+) -> None:
+    """Estimate by a film alone, print, and write tables and figures beside it, in ``<stem>-deflection``.
+
+    ``times`` is a list of frames, or their rate in Hz; ``changes`` are changes of `Flight.with_`.
+    """
+    from postflight.film_alone import read_film
+
+    try:
+        when: str | float = float(times)
+    except ValueError:
+        when = times
+    film = read_film(pictures, when, vehicle, camera=camera, benchmark_s=benchmark_s).with_(**changes)
+    compile_kernels("camera")
+    with progress_bar() as report:
+        answers = estimate(film, ("camera",), report)
+    for words, code in few_of_each(film.findings):
+        console.coded("[yellow]found[/]", words, code)
+    camera_words = [f"camera: {history.assumptions}" for history in answers.histories.values()]
+    _finish_alone(pictures, answers, camera_words, film)
+
+
+def _finish_alone(given: Path, answers: Deflections, words: list[str], film: Flight | None = None) -> None:
+    """Write answers that no run holds into ``<stem>-deflection`` beside what they were made from, and print them."""
+    from postflight.plots.run_figures import draw_alone
+
+    out = run_folder.Results(given.with_name(f"{given.stem}-deflection"))
+    (out.path / "figures").mkdir(parents=True, exist_ok=True)
+    out.write_csv("answers.csv", answers.to_frame())
+    run_folder.write_answers(out, answers)
+    run_folder.write_checks(out, answers.consistency_checks)
+    draw_alone(answers, FigureFolder(out.path / "figures"), film)
+    print_answers(answers)
+    for line in (*words, f"results in {out.path}"):
+        console.print(line, markup=False)
+    if answers.refused:
+        sys.exit(EXIT_NO_ANSWER)
 
 
 def calibrate(corners: Path, size: str, lens: Lens) -> None:

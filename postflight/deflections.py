@@ -16,7 +16,8 @@ from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Re
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, mean_over
 from flightmodel.events import find_peak
 from flightmodel.tabular import Tabular
-from postflight.flight import NO_VIDEO, READ, RECONSTRUCT, Flight
+from postflight.flight import READ, RECONSTRUCT, Flight
+from postflight.methods import Inputs
 from postflight.reconstruction import Reconstruction
 from postflight.streams import on_one_thread
 from recon.consistency import doubt
@@ -28,6 +29,7 @@ if TYPE_CHECKING:  # estimators are a quarter of a second to import, for command
     from postflight.flown_coefficients import AeroIncrements
 
 LOADS = f"{RECONSTRUCT} or pf.read_loads(table, vehicle)"
+FILM = "pf.read_film(pictures, times, vehicle)"
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
 NO_COMMON_ANSWER = ("inputs-far-off", "not-converged", "camera-time-bias", "not-observable")
@@ -232,7 +234,7 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
     ----------
     flown : Flight or Reconstruction
         With a reconstruction the deflection in the benchmark frame is found from the moment in the joint; with a
-        flight alone the benchmark frame is taken as undeflected.
+        flight, or a film alone (`read_film`), the benchmark frame is taken as undeflected.
     progress : callable, optional
 
     Returns
@@ -247,7 +249,7 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
     """
     from postflight.filming import camera_answer
 
-    check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ} or {RECONSTRUCT}")
+    check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ}, {FILM} or {RECONSTRUCT}")
     if isinstance(flown, Flight):
         return camera_answer(flown, None, progress).plain
     return camera_answer(flown.flight, flown, progress).history
@@ -339,14 +341,14 @@ def estimate(
     flight = flown if isinstance(flown, Flight) else None if bet is None else bet.flight
     answers = Deflections(bet=bet, loads=loads)
     fused, filmed = None, None
+    missing = _inputs(flight, loads).missing()
     for k, method in enumerate(sorted(methods, key=_AS_RUN.index)):
         report(k / len(methods), f"deflection from {method}")
         try:
+            if method in missing:
+                raise GateError([missing[method]])
             if method == "camera":
-                if flight is None:
-                    raise GateError(
-                        "camera: a table of loads has no film; `[frames]` of a flight folder does", NO_VIDEO
-                    )
+                assert flight is not None  # whose film it is
                 from postflight.filming import camera_answer, keep_oriented
 
                 shown = part_of(report, k / len(methods), (k + 1) / len(methods))
@@ -386,6 +388,12 @@ def estimate(
     refused = {m: answers.refused[m] for m in methods if m in answers.refused}
     smooth = filmed.smooth if filmed is not None and "camera" in histories else None
     return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed, smooth_camera=smooth)
+
+
+def _inputs(flight: Flight | None, loads: FlightLoads | None) -> Inputs:
+    """What there is of a flight, or of loads."""
+    given = loads if flight is None else flight.telemetry
+    return Inputs() if given is None else Inputs.of(given)
 
 
 def with_increments(answers: Deflections) -> Deflections:

@@ -29,7 +29,8 @@ from flightmodel.film import Frames
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import nearest_index
 from flightmodel.vehicle import Vehicle
-from postflight.flight import NO_VIDEO, Flight
+from postflight.flight import Flight
+from postflight.methods import Inputs
 from postflight.reconstruction import Reconstruction
 
 _SAME_FRAME_S = 1e-3
@@ -88,8 +89,8 @@ class CameraAnswer:
 def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress | None = None) -> FilmFit:
     """What a film shows, frame by frame, the first camera's without ``frames``; `GateError` where it cannot be used."""
     frames = flight.telemetry.frames if frames is None else frames
-    if frames is None:
-        raise GateError("the flight has no video", NO_VIDEO)
+    Inputs.of(flight.telemetry).require("camera")
+    assert frames is not None
     vehicle = flight.telemetry.required_vehicle()
     return read_film(
         frames.time_s,
@@ -291,7 +292,7 @@ def _benchmark(
     """Deflection of the benchmark frame by the moment in the joint; None, with the reason, where there is none."""
     try:
         if bet is None:
-            flight.telemetry.required_triads()
+            Inputs.of(flight.telemetry).require("misalignment")
             raise GateError("no trajectory was made", "input-missing")
         frames = film.relative_to_benchmark(late_s)
         return benchmark_deflection(frames, bet.required_loads(), film.oriented.apriori.benchmark_rad), ""

@@ -40,6 +40,7 @@ from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from postflight.checks.track_clocks import clock_faults
 from postflight.flight import READ, Flight
+from postflight.methods import Inputs
 from postflight.streams import on_one_thread
 from recon.atmosphere import (
     HALF_WINDOW_S,
@@ -303,6 +304,7 @@ def reconstruct(flight: Flight, settings: Settings | None = None, progress: Prog
     if settings is not None:
         check_type("reconstruct: settings", settings, Settings, "pf.Settings(...)")
         flight = replace(flight, settings=settings)
+    Inputs.of(flight.telemetry).require("trajectory")
     report(0.0, "reconstructing")
     try:
         solution = solve(flight.telemetry, flight.settings, lambda f, what: report(0.95 * f, what))

@@ -78,7 +78,34 @@ _PEAKS = {
 _EVENT_COLUMNS = ("alt_m", "speed_ground_mps", "flight_path_deg", "mach", "dynamic_pressure_pa", "alpha_total_wind_deg")
 
 
-class RunFolder:
+class Results:
+    """Folder that tables and JSON objects are written to."""
+
+    def __init__(self, path: Path) -> None:
+        """Take the folder, which need not exist yet."""
+        self.path = path
+
+    def write_csv(self, name: str, table: pd.DataFrame) -> None:
+        """Write a table."""
+        written = plain_text(table)
+        with (self.path / name).open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(written)
+            numbers = written.shape[1] > 1 and bool((written.dtypes == np.float64).all())
+            for first in range(0, len(written), _ROWS):  # as text a trajectory would be 40 MB
+                rows = written[first : first + _ROWS]
+                if numbers:
+                    file.write(_lines(rows.to_numpy()))
+                else:
+                    writer.writerows(zip(*(_cells(column) for _, column in rows.items()), strict=True))
+
+    def write_json(self, name: str, value: Any) -> None:
+        """Write one JSON object; NaN becomes null."""
+        text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
+        (self.path / name).write_text(text + "\n")
+
+
+class RunFolder(Results):
     """A run folder under construction: use as a context; it is renamed into place when the block ends well."""
 
     def __init__(
@@ -98,7 +125,7 @@ class RunFolder:
         self.settings = settings
         self.telemetry = telemetry
         self.parent = flight_folder / "runs"
-        self.path = Path()
+        super().__init__(Path())
 
     def __enter__(self) -> RunFolder:
         """Make the partial folder beside the final one."""
@@ -174,25 +201,6 @@ class RunFolder:
             self.path = final
             return
         raise GateError(f"{final}: other processes write the same run; run it again", "cannot-write")
-
-    def write_csv(self, name: str, table: pd.DataFrame) -> None:
-        """Write a table."""
-        written = plain_text(table)
-        with (self.path / name).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(written)
-            numbers = written.shape[1] > 1 and bool((written.dtypes == np.float64).all())
-            for first in range(0, len(written), _ROWS):  # as text a trajectory would be 40 MB
-                rows = written[first : first + _ROWS]
-                if numbers:
-                    file.write(_lines(rows.to_numpy()))
-                else:
-                    writer.writerows(zip(*(_cells(column) for _, column in rows.items()), strict=True))
-
-    def write_json(self, name: str, value: Any) -> None:
-        """Write one JSON object; NaN becomes null."""
-        text = json.dumps(_no_nan(value), indent=2, allow_nan=False)
-        (self.path / name).write_text(text + "\n")
 
 
 # what a spreadsheet takes for a formula; a name such as -x, of letters and digits, computes nothing
@@ -331,14 +339,14 @@ def write_all_checks(run: RunFolder, flight: Reconstruction, answers: Deflection
     )
 
 
-def write_checks(run: RunFolder, checks: Iterable[Check]) -> pd.DataFrame:
+def write_checks(run: Results, checks: Iterable[Check]) -> pd.DataFrame:
     """Write ``consistency_checks.csv``, and return it."""
     table = pd.DataFrame([vars(v) for v in checks], columns=[f.name for f in fields(Check)])
     run.write_csv("consistency_checks.csv", table)
     return table
 
 
-def write_answers(run: RunFolder, answers: Deflections) -> None:
+def write_answers(run: Results, answers: Deflections) -> None:
     """Write a table for each method that answered, and those of the fusion."""
     for method, history in answers.histories.items():
         run.write_csv(f"deflection_{method}.csv", history.to_frame())

@@ -35,6 +35,7 @@ from postflight.checks.track_force import best_comparison, bias_of, track_force
 from postflight.checks.units_and_axes import TimeBias, clock_remarks
 from postflight.checks.vehicle_check import vehicle_issues
 from postflight.intake.flight_form import placeholders
+from postflight.methods import Inputs, runs_alone
 from postflight.streams import write_out
 from postflight.terminal import EXIT_CHECK_FAILED, few_of_each, terminal
 
@@ -60,7 +61,10 @@ class Fact:
 
 @dataclass(repr=False)
 class Report(Tabular):
-    """Everything that a check found; ``exit_code`` as the command leaves with."""
+    """Everything that a check found; ``exit_code`` as the command leaves with.
+
+    ``inputs`` are those of the flight, ``alone`` what commands without flight.toml have data for.
+    """
 
     facts: list[Fact] = field(default_factory=list)
     findings: list[Issue] = field(default_factory=list)
@@ -69,6 +73,8 @@ class Report(Tabular):
     assumed: dict[str, dict[str, float]] = field(default_factory=dict)
     fill_in: list[str] = field(default_factory=list)
     refused: list[Issue] = field(default_factory=list)
+    inputs: Inputs | None = None
+    alone: dict[str, Inputs] = field(default_factory=dict)
     exit_code: int = 0
 
     def to_frame(self) -> pd.DataFrame:
@@ -90,10 +96,19 @@ class Report(Tabular):
         stated = ", ".join(f"{count} {what if count > 1 else one}" for count, what, one in counts if count)
         return stated or "no findings; all can be read"
 
+    @property
+    def can_run(self) -> str:
+        """Methods that can run, and what the others lack."""
+        words = ["nothing before the refused inputs are corrected"] if self.refused else []
+        if self.inputs is not None and not self.refused:
+            words.append(str(self.inputs))
+        return "; ".join([*words, *(f"{inputs.names} ({command})" for command, inputs in self.alone.items())])
+
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON; times that are none become null."""
         biases = self.time_biases
         return {
+            "can_run": self.can_run,
             "facts": _rows(self.facts),
             "findings": _rows(self.findings),
             "cross_checks": _rows(self.cross_checks),
@@ -127,8 +142,10 @@ def check_folder(folder: Path) -> Report:
         Refusals are in it and never raised.
     """
     report = Report()
+    if not (folder / "flight.toml").exists() and _runs_alone(report, folder, None):
+        return report
     try:
-        found = read_sources(folder)
+        found = read_sources(folder, needs_path=False)
     except GateError as fault:
         _refuse(report, folder, [*fault.faults, *_vehicle_faults(folder)], fault.exit_code)
         report.findings = _not_used(folder)
@@ -138,6 +155,9 @@ def check_folder(folder: Path) -> Report:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
     report.facts = _facts(found)
     report.assumed = assumed_errors(found.spec, found.radars, found.gnss)
+    report.inputs = Inputs.of(found)
+    if found.vehicle is not None and "misalignment" in report.inputs.missing():
+        _runs_alone(report, folder, found.vehicle.source)
     report.findings = _not_used(folder) + sorted(
         gate.findings, key=lambda f: (f.source, np.nan_to_num(f.start_s, nan=-np.inf))
     )
@@ -146,11 +166,26 @@ def check_folder(folder: Path) -> Report:
     return report
 
 
+def _runs_alone(report: Report, folder: Path, vehicle: Path | None) -> bool:
+    """Whether a method runs by tables and pictures that flight.toml does not name; the only vehicle file by default."""
+    found = [vehicle] if vehicle else [*folder.glob("*.toml"), *folder.glob("vehicle/*.toml")]
+    if len(found) == 1:
+        report.alone = runs_alone(folder, found[0], _named(folder) or set())
+    return bool(report.alone)
+
+
+def _named(folder: Path) -> set[str] | None:
+    """Every text of flight.toml; None where it cannot be read."""
+    try:
+        return set(_texts(read_toml(folder / "flight.toml")))
+    except GateError:
+        return None
+
+
 def _not_used(folder: Path) -> list[Issue]:
     """Tables below ``telemetry/`` that flight.toml does not name: delivered, imported perhaps, and read by nobody."""
-    try:
-        named = set(_texts(read_toml(folder / "flight.toml")))
-    except GateError:
+    named = _named(folder)
+    if named is None:
         return []
     there = sorted(path.relative_to(folder).as_posix() for path in (folder / "telemetry").glob("*.csv"))
     words = "no table of flight.toml reads it; declare its columns there, or remove it"
@@ -337,7 +372,8 @@ def check(folder: Path, as_json: bool, strict: bool = False) -> None:
 
 
 def print_report(report: Report) -> None:
-    """Print tables and lines for a reader, codes in brackets."""
+    """Print tables and lines for a reader, codes in brackets; first what can run."""
+    console.print(f"can run: {escape(report.can_run)}", highlight=False)
     if report.facts:
         table = Table(title="Sensors")
         for name in ("source", "rows", "from s", "to s", "rate Hz", "missing", "file"):

@@ -12,7 +12,13 @@ from postflight.deflections import Deflections
 from postflight.filming import by_camera, keep_oriented
 from postflight.flight import Flight
 from postflight.flown_coefficients import AeroIncrements
-from postflight.plots.deflection import figure_correlation, figure_fusion, figure_increments, figure_summary
+from postflight.plots.deflection import (
+    figure_correlation,
+    figure_deflection,
+    figure_fusion,
+    figure_increments,
+    figure_summary,
+)
 from postflight.plots.overlay import deflection_at, oriented_camera, write_overlay
 from postflight.plots.paper_figures import (
     figure_1_3,
@@ -75,12 +81,26 @@ def draw_trajectory(flight: Reconstruction, figures: FigureFolder) -> None:
 def draw_deflections(flight: Reconstruction, figures: FigureFolder, answers: Deflections) -> None:
     """Draw the answers of the methods, and what the fusion rests on."""
     answers = replace(answers, bet=flight)  # which is not handed over twice to a second process
-    if "misalignment" in answers.histories:
-        figures.draw("figure_2_7", figure_2_7, answers)
     if "camera" in answers.histories:
         if answers.camera is not None:  # in a second process nothing is oriented yet
             keep_oriented(flight.telemetry, answers.camera.oriented)
         _draw_cameras(flight.flight, answers.histories["camera"], figures)
+    _draw_loads(answers, figures)
+
+
+def draw_alone(answers: Deflections, figures: FigureFolder, film: Flight | None) -> None:
+    """Draw answers by a table of loads, or by a ``film``, without a trajectory of this program."""
+    if film is None:
+        _draw_loads(answers, figures)
+    elif "camera" in answers.histories:
+        _draw_cameras(film, answers.histories["camera"], figures)
+        figures.draw("deflection", figure_deflection, answers)
+
+
+def _draw_loads(answers: Deflections, figures: FigureFolder) -> None:
+    """Draw what answers and their loads show together."""
+    if "misalignment" in answers.histories:
+        figures.draw("figure_2_7", figure_2_7, answers)
     if answers.fused is not None:
         figures.draw("fusion", figure_fusion, answers)
         figures.draw("correlation", figure_correlation, answers)

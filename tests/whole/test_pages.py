@@ -28,7 +28,9 @@ from tests.refusing import printed_codes
 READER_HAS = {
     "another-planet.md": ("examples",),
     "README.md": ("delivered", "corners.csv", "my-scenario.toml"),
+    "camera.md": ("examples",),
     "check.md": ("my-flight",),
+    "deflection.md": ("examples",),
     "exports.md": ("my-flight",),
     "how-to.md": ("demo-flight", "examples", "tests"),
     "monte-carlo.md": (),
@@ -123,6 +125,11 @@ WRITES = {
     "postflight reconstruct my-flight --sensitivity": "my-flight/runs/*/sensitivity.csv",
     "postflight reconstruct demo-flight --sensitivity": "demo-flight/runs/*/sensitivity.csv",
     "postflight deflection my-flight --method camera --film": "my-flight/runs/*/figures/overlay.webm",
+    "postflight deflection --loads examples/loads_table/bet.csv --vehicle examples/loads_table/vehicle.toml": (
+        "examples/loads_table/bet-deflection/*.csv examples/loads_table/bet-deflection/figures/summary.png"
+    ),
+    "postflight deflection --film examples/film_alone/pictures --times examples/film_alone/frames.csv "
+    "--vehicle examples/film_alone/vehicle.toml": "examples/film_alone/pictures-deflection/figures/overlay.png",
     "postflight simulate my-scenario.toml": "my-scenario-flight/flight.toml my-scenario-flight/truth/truth.csv",
     "postflight init flight-b --vehicle irve2_reference": "flight-b/flight.toml",
     "postflight init flight-c --vehicle flight-a/vehicle/vehicle.toml": "flight-c/vehicle/vehicle.toml",

@@ -1,0 +1,133 @@
+"""Which methods can run on the data at hand, and what do the others lack?
+
+One place decides (`Inputs.missing`): ``postflight check`` says it in its first line, and a method that is asked for
+without its data is refused with the same words.
+
+| method | needs |
+|---|---|
+| trajectory | a tracker (radar or receiver), or an entry state |
+| camera | a film and a vehicle file |
+| misalignment, trim, fused | the trajectory with accelerometer and gyros, or a table of loads; a vehicle file |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from estimators.loads import FlightLoads
+from flightmodel.checks import GateError, Issue
+from flightmodel.flightfolder import Sources
+from flightmodel.telemetry import Telemetry
+from postflight.flight import NO_VIDEO, Flight
+
+_FILMS = (".webm", ".mp4", ".avi")
+BY_LOADS = ("misalignment", "trim", "fused")
+_NO_TRACKER = Issue(
+    "there is no radar, receiver or entry state, which the trajectory needs: state [radars.NAME], [gnss.NAME] or "
+    "[start.state]; a table of another trajectory takes its place (--loads, pf.read_loads)",
+    "tracker-missing",
+)
+_NO_FILM = Issue("there is no film, which the camera needs: [frames] in flight.toml names one", NO_VIDEO)
+_NO_VEHICLE = Issue(
+    'there is no vehicle file, which every estimate of the deflection needs: write vehicle = "..." in flight.toml',
+    "vehicle-missing",
+)
+_NO_TRIADS = Issue(
+    "there are no inertial sensors, which misalignment, trim and the fusion need: state [sensors.accelerometer] and "
+    "[sensors.rates]",
+    "inertial-missing",
+)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What data there are: vehicle file, film, accelerometer with gyros, tracker (or entry state), table of loads."""
+
+    vehicle: bool = False
+    film: bool = False
+    inertial: bool = False
+    tracker: bool = False
+    loads: bool = False
+
+    @classmethod
+    def of(cls, given: Telemetry | Sources | FlightLoads) -> Inputs:
+        """Find what telemetry, the sources of a flight folder, or loads hold."""
+        if isinstance(given, FlightLoads):
+            return cls(vehicle=True, loads=True)
+        if isinstance(given, Sources):
+            inertial, state = {"accelerometer", "rates"} <= set(given.triads), given.state
+        else:
+            inertial, state = given.accelerometer is not None and given.rates is not None, given.start.state
+        tracker = bool(given.radars or given.gnss or state is not None)
+        return cls(given.vehicle is not None, bool(given.films), inertial, tracker)
+
+    def missing(self) -> dict[str, Issue]:
+        """Why a method cannot run, by method; those that can are not among them."""
+        out = {}
+        if not self.tracker:
+            out["trajectory"] = _NO_TRACKER
+        if not (self.film and self.vehicle):
+            out["camera"] = _NO_VEHICLE if self.film else _NO_FILM
+        if not (self.vehicle and (self.loads or (self.inertial and self.tracker))):
+            why = _NO_VEHICLE if not self.vehicle else _NO_TRIADS if not self.inertial else _NO_TRACKER
+            out |= dict.fromkeys(BY_LOADS, why)
+        return out
+
+    def require(self, method: str) -> None:
+        """Raise `GateError` with the reason where a method cannot run."""
+        if method in (missing := self.missing()):
+            raise GateError([missing[method]])
+
+    @property
+    def names(self) -> str:
+        """Methods that can run, in words."""
+        missing = self.missing()
+        can = [method for method in ("trajectory", "camera", *BY_LOADS) if method not in missing]
+        if not missing:
+            return f"all ({', '.join(can)})"
+        if self.loads and not (self.tracker or self.film):
+            return "misalignment and trim from loads"
+        return f"{can[0]} alone" if len(can) == 1 else ", ".join(can) or "nothing"
+
+    def __str__(self) -> str:
+        """Methods that can run, and what the others lack."""
+        return "; ".join([self.names, *dict.fromkeys(self.missing().values())])
+
+
+def runs_alone(folder: Path, vehicle: Path, named: set[str]) -> dict[str, Inputs]:
+    """Find tables and pictures of a folder from which a method runs without flight.toml.
+
+    Parameters
+    ----------
+    folder : Path
+    vehicle : Path
+        Vehicle file.
+    named : set of str
+        Tables that flight.toml reads, relative to the folder, which are left out.
+
+    Returns
+    -------
+    dict of Inputs
+        What each command, written out, has data for.
+    """
+    from postflight.film_alone import read_film
+    from postflight.loads_table import read_loads
+
+    out: dict[str, Inputs] = {}
+    tables = [path for place in (folder, folder / "telemetry") for path in sorted(place.glob("*.csv"))]
+    for table in (path for path in tables if path.relative_to(folder).as_posix() not in named):
+        beside = sorted(path for path in table.parent.iterdir() if path.is_dir() or path.suffix in _FILMS)
+        attempts: dict[str, Callable[[], FlightLoads | Flight]] = {
+            f"--loads {table}": partial(read_loads, table, vehicle),
+            **{f"--film {film} --times {table}": partial(read_film, film, table, vehicle) for film in beside},
+        }
+        for words, read in attempts.items():
+            with suppress(GateError):
+                found = read()
+                inputs = Inputs.of(found if isinstance(found, FlightLoads) else found.telemetry)
+                out[f"postflight deflection {words} --vehicle {vehicle}"] = inputs
+    return out
