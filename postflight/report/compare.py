@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from flightmodel.checks import ConfigError, GateError, Issue
 from flightmodel.files import abandoned, partial_path, writing
+from flightmodel.statistics import decimals, pair
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
 from postflight.plots.style import LABEL, MANY
@@ -25,7 +26,6 @@ from postflight.report.text import cell, date
 from postflight.report.write import charts, pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import Run, find_run, is_complete, read_tables
-from postflight.systematic_differences import digits
 from postflight.terminal import terminal
 
 PAGE_NAME = "compare.html"
@@ -195,7 +195,7 @@ def _number(value: float, sd: float) -> str:
         return ""
     if not (np.isfinite(sd) and sd > 0.0):
         return f"{value:.2f}"
-    return f"{value:.{digits(sd)}f} ± {sd:.{digits(sd)}f}"
+    return pair(value, sd)
 
 
 def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str]:
@@ -205,7 +205,7 @@ def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str
         return ["", ""]
     if not (np.isfinite(high) and high > 0.0):
         return [f"{change:+.2f}", ""]
-    shown = digits(high)
+    shown = decimals(high)
     spread = f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}"
     return [f"{change:+.{shown}f}", spread]
 

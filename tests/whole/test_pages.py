@@ -96,7 +96,7 @@ NOT_RUN |= dict.fromkeys(
 )
 # blocks that are no commands, or not those alone, by their first line
 SHOWN = (
-    "Deflection at the true peak of dynamic pressure", "my-flight/",
+    "Deflection at peak q", "my-flight/",
     "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "docker build",
 )  # fmt: skip
 # what a command leaves, beside its exit code
@@ -327,7 +327,7 @@ def as_shown(printed: str) -> None:
 def test_what_the_readme_shows_is_printed(short: Path, capsys, monkeypatch) -> None:
     printed = runner(capsys, monkeypatch)("score", short, cwd=short.parent).stdout.splitlines()
     shown = (ROOT / "README.md").read_text().splitlines()
-    for mark in ("┃ method", "Deflection at the true peak of dynamic pressure ("):
+    for mark in ("┃ method", "Deflection at peak q ("):
         (ours,), (theirs,) = ([line for line in text if line.lstrip().startswith(mark)] for text in (printed, shown))
         assert re.sub(r"[\d.]+ s\)", "s)", ours.strip()) == re.sub(r"[\d.]+ s\)", "s)", theirs)
 
