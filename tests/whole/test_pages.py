@@ -318,6 +318,7 @@ def as_shown(printed: str) -> None:
         )
         assert shown == pytest.approx(ours, abs=0.011)
         assert told == pytest.approx(ours, abs=0.011)
+    assert re.search(r"Deflection at peak q .* \(fused\)", printed)[0] in readme
 
 
 # ------------------------------------------------------------------------------------------------------- the lists
