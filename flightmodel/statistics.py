@@ -42,7 +42,7 @@ def decimals(sd: float) -> int:
     if not (math.isfinite(sd) and sd > 0.0):
         return 2
     exponent = math.floor(math.log10(sd))
-    return min(max((sd < 3.55 * 10.0**exponent) - exponent, 0), 6)
+    return min(max((sd < 3.55 * 10.0**exponent) - exponent, 0), 9)
 
 
 def pair(value: float, sd: float) -> str:

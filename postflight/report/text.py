@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from flightmodel.config import parse_utc
 from flightmodel.deflection import QUANTILES, interpolation_error, lateral_axes, lv_clock, lv_direction
 from flightmodel.statistics import decimals, pair
+from flightmodel.tables import column_about
 from postflight.deflections import METHODS, headline, said
 from postflight.plots.style import COLOUR, LABEL
 from postflight.report.view_3d import best_method, hole_s
@@ -36,6 +37,7 @@ _BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "tri
 _ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
+LISTS = ("camera_frames", "shell_shape")  # tables that are not printed: their CSV is for them
 _UNITS = {"deg": "deg", "m": "m", "mps": "m/s"}
 _NEAR_PEAK_S = 1.0  # window about the peak
 
@@ -55,7 +57,7 @@ def _utc(run: Run, time_s: float) -> str:
 def title(run: Run) -> str:
     """Return the answer in one line, which begins with its doubt where checks fail."""
     words = f"In doubt: {_answer(run)}" if _doubt(run) else _answer(run)
-    return re.sub(r" (?=[±\d])", "\u00a0", words)  # no line ends before a number
+    return re.sub(r" (?=[±\d]|mean|q\b)", "\u00a0", words)  # no line ends between a name and its number
 
 
 def _doubt(run: Run) -> str:
@@ -281,11 +283,36 @@ def events(run: Run) -> list[dict[str, Any]]:
     return rows
 
 
+def main_columns(table: pd.DataFrame) -> pd.DataFrame:
+    """Table without what its CSV alone needs: preflight values, correlations, and times beside Mach numbers."""
+    aside = r"correlation_c|.*_preflight$|alpha_shell_deg$" + ("|t_s$" if "mach" in table else "")
+    return table[[name for name in table if not re.match(aside, str(name))]]
+
+
 def table_rows(table: pd.DataFrame) -> dict[str, Any]:
-    """Column names and cells of a small table, and how many rows are left out."""
+    """Column names and cells of a small table, and how many rows are left out; a value stands with its sd."""
     shown = table.head(SHOWN_ROWS)
-    cells = [[cell(x) for x in row] for row in shown.itertuples(index=False)]
-    return {"names": [str(n).replace("_", " ") for n in table.columns], "rows": cells, "more": len(table) - len(shown)}
+    sds = {name: sd for name in table for sd in (_sd_column(str(name)),) if sd in table}
+    columns = {
+        str(name).replace("_", " "): [
+            pair(x, sd) if np.isfinite(x) and np.isfinite(sd) else cell(x)
+            for x, sd in zip(shown[name], shown[sds[name]], strict=True)
+        ]
+        if name in sds
+        else [cell(x) for x in shown[name]]
+        for name in table
+        if name not in sds.values()
+    }
+    return {
+        "names": list(columns),
+        "rows": list(map(list, zip(*columns.values(), strict=True))),
+        "more": len(table) - len(shown),
+    }
+
+
+def _sd_column(name: str) -> str:
+    """Column that would hold the standard deviation of another one."""
+    return "sd" if name in ("estimate", "value") else column_about(name)
 
 
 def sensitivity_rows(table: pd.DataFrame) -> dict[str, Any]:

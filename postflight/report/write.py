@@ -170,7 +170,11 @@ def _texts(run: Run) -> dict[str, Any]:
         "events": text.events(run),
         "findings": text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
         "checks": text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
-        "extra": [(title, text.table_rows(run.tables[name])) for name, title in more.items() if name in run.tables],
+        "extra": [
+            (title, f"{name}.csv" if name in text.LISTS else "", text.table_rows(text.main_columns(run.tables[name])))
+            for name, title in more.items()
+            if name in run.tables
+        ],
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
