@@ -347,7 +347,12 @@ def deflection(
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 def camera(folder: Path, name: str | None, port: int, browser: bool) -> None:
     """Work at the film in FOLDER by hand: step through it, try deflections, mask, mark, accept and reject."""
-    from postflight.camera_bench import server
+    from flightmodel.checks import ConfigError
+
+    try:
+        from postflight.camera_bench import server
+    except ModuleNotFoundError:
+        raise ConfigError("camera needs Werkzeug: pip install 'postflight[bench]'", code="package-missing") from None
 
     server.open_bench(folder, name, port, browser)
 
