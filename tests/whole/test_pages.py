@@ -102,7 +102,7 @@ SHOWN = (
 # what a command leaves, beside its exit code
 WRITES = {
     "postflight demo demo-flight": "demo-flight/demo.png demo-flight/runs/*/report.html",
-    "postflight init my-flight": "my-flight/flight.toml my-flight/vehicle/vehicle.toml",
+    "postflight init my-flight --vehicle form": "my-flight/flight.toml my-flight/vehicle/vehicle.toml",
     "postflight import delivered/* --into my-flight": "my-flight/telemetry/*.csv my-flight/telemetry/*/*.png",
     "postflight run my-flight": "my-flight/runs/*/deflection_fused.csv my-flight/runs/*/figures/*.png",
     "postflight export my-flight --to nc": "my-flight/exports/*.nc",
