@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 import unicodedata
 from collections.abc import Iterable, Iterator
@@ -24,6 +25,7 @@ from pydantic import (
 
 from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.files import file_bytes, leads_outside, nothing_at
+from flightmodel.units import UNITS, read_unit
 
 # what a number may be: far wider than any flight, so that what lies outside is a slip of the pen
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -83,7 +85,8 @@ class KeyFaults(ValueError):
 class Section(BaseModel):
     """Base of all configuration tables: immutable, unknown keys refused, numbers finite and nothing else than numbers.
 
-    Whole numbers pass where a number is wanted; true, false and text do not.
+    Whole numbers pass where a number is wanted, and so does text with a unit (``"4 mg"``) for a key whose name ends
+    with a unit; true, false and other text do not.
     """
 
     # built at first use: a command reads few of the tables that it imports
@@ -98,11 +101,11 @@ class Section(BaseModel):
                 raise ValueError(FILL_IN)
             if isinstance(leaf, bool) and bool not in wanted and wanted & {int, float}:
                 raise ValueError("a number is wanted, not true or false")
-            if isinstance(leaf, str) and str not in wanted and wanted & {int, float, bool}:
-                raise ValueError("a number is wanted, not text" if bool not in wanted else "true or false is wanted")
+            if isinstance(leaf, str) and str not in wanted and bool in wanted:
+                raise ValueError("true or false is wanted")
             if isinstance(leaf, (int, float)) and wanted == {bool} and not isinstance(leaf, bool):
                 raise ValueError("true or false is wanted")
-        return value
+        return _numbers_of(value, str(info.field_name)) if wanted & {int, float} and str not in wanted else value
 
     def key_faults(self) -> Iterable[KeyFault]:
         """Yield what keys do not fit each other; each is sound by itself."""
@@ -113,6 +116,26 @@ class Section(BaseModel):
         if faults := [*self.key_faults()]:
             raise KeyFaults(faults)
         return self
+
+
+_WITH_UNIT = re.compile(r"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\s\d.].*?)\s*")
+
+
+def _numbers_of(value: Any, key: str) -> Any:
+    """Value in which texts with a unit, as data sheets have them, are numbers in the unit that ends the key's name."""
+    if isinstance(value, (list, tuple)):
+        return [_numbers_of(part, key) for part in value]
+    if not isinstance(value, str):
+        return value
+    *name, last = key.split("_")
+    own, text = UNITS.get(last), _WITH_UNIT.fullmatch(value)
+    if own is None or text is None:
+        raise ValueError("a number is wanted, not text")
+    given = read_unit(text[2] if len(text[2]) > 1 else text[2].lower())  # K, T
+    if given is None or given.kind != own.kind:
+        raise ValueError(f"a number of {last} is wanted, or one with a unit of {own.kind}")
+    apart = 0.0 if {"sd", "bias"} & set(name) else given.offset - own.offset  # a difference has no zero
+    return (float(text[1]) * given.factor + apart) / own.factor
 
 
 @cache  # a study checks the same few fields a hundred thousand times

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.camera_edits import EDITS_FILE
@@ -252,6 +252,24 @@ class FlightFile(Section):
     cameras: dict[Name, FramesEntry] = {}
     events: list[EventEntry] = []
     reconstruction: dict[str, Any] = {}  # checked by `recon.settings.Settings`
+
+    @model_validator(mode="before")
+    @classmethod
+    def _times_of_others(cls, value: Any) -> Any:
+        """``time = "sensors.rates"`` is the time of that table: one delivery of several sensors has one time column."""
+        if not isinstance(value, dict):
+            return value
+        groups = {
+            k: dict(value[k]) for k in ("sensors", "radars", "gnss", "barometers") if isinstance(value.get(k), dict)
+        }
+        for entries in groups.values():
+            for name, entry in entries.items():
+                if isinstance(entry, dict) and isinstance(entry.get("time"), str):
+                    group, _, other = entry["time"].partition(".")
+                    found = value.get(group, {}).get(other) if isinstance(value.get(group), dict) else None
+                    if isinstance(found, dict):
+                        entries[name] = entry | {"time": found.get("time", {})}
+        return value | groups
 
     @field_validator("t0_utc")
     @classmethod

@@ -14,6 +14,7 @@ A. Gelb (ed.), Applied Optimal Estimation, MIT Press, 1974, section 3.8 (exponen
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -30,6 +31,24 @@ BAND_COLUMNS = tuple(f"p{p:g}" for p in BAND_PERCENTILES)
 def chi_square_quantile(probability: float, degrees: float) -> float:
     """Value below which a chi-square number of ``degrees`` stays; `scipy.stats`, which has it, takes long to load."""
     return float(2.0 * gammaincinv(0.5 * degrees, probability))
+
+
+def decimals(sd: float) -> int:
+    """Decimals in which a value with this standard deviation is printed.
+
+    The standard deviation keeps two digits below 355, 3.55, 0.0355, ... and one above (Particle Data Group, *Review of
+    Particle Physics*, introduction, section 5.3); digits left of the point stay. Without one there are two decimals.
+    """
+    if not (math.isfinite(sd) and sd > 0.0):
+        return 2
+    exponent = math.floor(math.log10(sd))
+    return min(max((sd < 3.55 * 10.0**exponent) - exponent, 0), 9)
+
+
+def pair(value: float, sd: float) -> str:
+    """``4.91 ± 0.08``: a value and its standard deviation in the `decimals` that this deserves."""
+    places = decimals(sd)
+    return f"{value:.{places}f} ± {sd:.{places}f}"
 
 
 def correlation(at: FloatArray, length: float, constant_part: float = 0.0) -> FloatArray:

@@ -362,7 +362,12 @@ def deflection(
 @click.option("--browser/--no-browser", default=True, show_default=True, help="Open the page in the browser.")
 def camera(folder: Path, name: str | None, port: int, browser: bool) -> None:
     """Work at the film in FOLDER by hand: step through it, try deflections, mask, mark, accept and reject."""
-    from postflight.camera_bench import server
+    from flightmodel.checks import ConfigError
+
+    try:
+        from postflight.camera_bench import server
+    except ModuleNotFoundError:
+        raise ConfigError("camera needs Werkzeug: pip install 'postflight[bench]'", code="package-missing") from None
 
     server.open_bench(folder, name, port, browser)
 
@@ -502,16 +507,16 @@ def check(folder: Path, as_json: bool, strict: bool, **of_vehicle: Any) -> None:
 @cli.command()
 @click.argument("folder", type=FOLDER)
 @click.option(
-    "--vehicle", metavar="NAME", help="A vehicle that ships, or a .toml file to copy; default: a form to fill in."
+    "--vehicle", metavar="NAME", help="A vehicle that ships, a .toml file to copy, or 'form' for one to fill in."
 )
-@click.option("--no-vehicle", is_flag=True, help="For the trajectory alone: no vehicle file.")
-def init(folder: Path, vehicle: str | None, no_vehicle: bool) -> None:
-    """Write a commented flight.toml and vehicle file into FOLDER; what exists is never overwritten."""
+def init(folder: Path, vehicle: str | None) -> None:
+    """Write a commented flight.toml into FOLDER; what exists is never overwritten.
+
+    A trajectory needs no vehicle file, deflections do.
+    """
     from postflight.intake import flight_form
 
-    if vehicle is not None and no_vehicle:
-        raise click.UsageError("--vehicle names one; leave out --no-vehicle")
-    flight_form.init(folder, vehicle, no_vehicle)
+    flight_form.init(folder, vehicle)
 
 
 @cli.command("import")

@@ -23,14 +23,16 @@ from rich.table import Table
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from flightmodel.config import parse_section
+from flightmodel.statistics import decimals, pair
 from flightmodel.vehicle import read_vehicle
 from postflight import run_folder, warmup
 from postflight.beside import Beside, Task, same
-from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, with_increments
+from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, said, with_increments
 from postflight.flight import NO_VIDEO, Flight, read_flight
 from postflight.methods import Inputs
 from postflight.plots.style import FigureFolder
 from postflight.reconstruction import Reconstruction, reconstruct
+from postflight.report.text import rests_on
 from postflight.report.write import write_report
 from postflight.runs import check_name, find_run
 from postflight.scoring import PUBLISHED_DEG, Limits, Score, score_run
@@ -397,8 +399,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
     for name in ("event", "t s", "altitude km", "Mach", "q Pa", "alpha total deg"):
         table.add_column(name, justify="left" if name == "event" else "right")
     for row in events.itertuples(index=False):
-        sd = row.alpha_total_wind_3sd_deg / 3.0
-        alpha = f"{row.alpha_total_wind_deg:.2f} ± {sd:.2f}" if flight.has_attitude else ""
+        alpha = pair(row.alpha_total_wind_deg, row.alpha_total_wind_3sd_deg / 3.0) if flight.has_attitude else ""
         pressure = f"{row.dynamic_pressure_pa:.1f}"
         table.add_row(row.event, f"{row.t_s:.2f}", f"{row.alt_m / 1e3:.2f}", f"{row.mach:.2f}", pressure, alpha)
     console.print(table)
@@ -411,8 +412,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
         console.coded("[yellow]left out[/]", f"as-flown atmosphere: {reason}", reason.code)
     if flight.attitude is not None and flight.attitude.comparison is not None:
         console.print(escape(flight.attitude.remark))
-    for rests in flight.rests_on:
-        console.print(escape(rests))
+    console.table("What the absolute values depend on", ("value", "on"), rests_on(flight.rests_on), ("on",))
     print_checks(flight.consistency_checks, "trajectory")
     for k, suspect in enumerate(flight.suspects):
         console.coded(f"[red]{'suspect' if k == 0 else 'also'}[/]", suspect, suspect.code)
@@ -461,29 +461,29 @@ def print_sensitivity(found: pd.DataFrame) -> None:
 
 
 def print_answers(answers: Deflections) -> None:
-    """Deflection method by method at peak dynamic pressure; without a trajectory at the largest."""
+    """Deflection method by method: at peak q (without a trajectory at the largest), cycle mean, largest."""
     if answers.doubt:
         console.coded("[red]in doubt[/]", answers.doubt, "answers-in-doubt")
-    at_s = answers.reference_s
-    cycle = answers.cycle_s
-    parts = [] if cycle is None else [f"mean over the cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s"]
-    parts.append("largest of the pulse" if answers.knows_peak else "largest")
-    if np.isfinite(at_s):
-        note = "peak q" if answers.knows_peak else "its largest; no trajectory was made"
-        parts.append(f"at {at_s:.2f} s ({note})")
-    table = Table(title=f"Deflection of the aeroshell against the centerbody, deg: {', '.join(parts)}; plane in deg LV")
-    means = () if cycle is None else ("mean",)
-    for name in ("method", *means, "largest", "at s", f"at {at_s:.1f} s", "5 to 95 %", "LV"):
+    at_s, cycle = answers.reference_s, answers.cycle_s
+    summary = run_folder.method_summary(answers, at_s)
+    here, peak = ("at peak q", "peak q at") if answers.knows_peak else ("there", "no trajectory was made; largest at")
+    title = f"Deflection of the aeroshell against the centerbody, deg: {peak} {at_s:.2f} s"
+    title += f"{'' if cycle is None else f', cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s'}; plane in deg LV"
+    names = (here, *(() if cycle is None else ("cycle mean",)), "largest", "at s", "5 to 95 %", "LV")
+    table = Table(title=title)
+    for name in ("method", *names):
         table.add_column(name, justify="left" if name == "method" else "right", no_wrap=name != "5 to 95 %")
     for row in answers.to_frame().itertuples(index=False):
         if not np.isfinite(row.theta_deg):
-            table.add_row(row.method, *[""] * (len(means) + 2), "no answer")
+            table.add_row(row.method, "no answer")
             continue
-        shown = [f"{row.mean_deg:.2f}" if np.isfinite(row.mean_deg) else ""] * len(means)
-        here = f"{row.theta_deg:.2f} ± {row.theta_sd_deg:.2f}"
-        within = f"{row.theta_p5_deg:.2f} to {row.theta_p95_deg:.2f}"
-        largest = f"{row.largest_deg:.2f}", f"{row.largest_t_s:.2f}"
-        table.add_row(row.method, *shown, *largest, here, within, f"{row.plane_lv_deg:.0f}")
+        places = decimals(row.theta_sd_deg)
+        words = said(summary[row.method], here) | {
+            "at s": f"{row.largest_t_s:.2f}",
+            "5 to 95 %": f"{row.theta_p5_deg:.{places}f} to {row.theta_p95_deg:.{places}f}",
+            "LV": f"{row.plane_lv_deg:.0f}",
+        }
+        table.add_row(row.method, *(words.get(name, "") for name in names))
     console.print(table)
     for check in answers.consistency_checks:
         if check.passed:
@@ -499,7 +499,7 @@ def print_answers(answers: Deflections) -> None:
     if answers.camera is not None and answers.camera.shape is not None:
         console.print(f"shell's shape under load, by video: {escape(answers.camera.shape.verdict)}")
     none: dict[tuple[str, str], list[str]] = {}
-    for method, row in run_folder.method_summary(answers, at_s).items():
+    for method, row in summary.items():
         if "reason" in row:
             none.setdefault((row["reason"], row["code"]), []).append(method)
     for (reason, code), methods in none.items():
@@ -651,17 +651,18 @@ def score(folder: Path, as_json: bool, wanted: str | None = None, limits: Limits
 
 def print_score(result: Score) -> None:
     """Estimates against the truth, with what was published of this vehicle's flight beside them."""
-    table = Table(title=f"Deflection at the true peak of dynamic pressure ({result.peak_s:.3f} s), against the truth")
+    table = Table(title=f"Deflection at peak q ({result.peak_s:.2f} s), deg, against the truth")
     title, published = PUBLISHED_DEG.get(result.vehicle, ("", {}))
-    for name in ("method", "deflection deg", "1 sd", "truth", "error", *([title] if title else [])):
+    for name in ("method", "at peak q", "1 sd", "truth", "error", *([title] if title else [])):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method, row in result.methods.items():
         beside = [f"{published[method]:g}" if method in published else ""] if title else []
         if row["deflection_deg"] is None:
             table.add_row(method, "no answer", "", f"{row['truth_deg']:.2f}", "", *beside)
             continue
-        numbers = (f"{row[k]:.2f}" for k in ("deflection_deg", "sd_deg", "truth_deg"))
-        table.add_row(method, *numbers, f"{row['error_deg']:+.2f}", *beside)
+        places = decimals(row["sd_deg"])
+        numbers = (f"{row[k]:.{places}f}" for k in ("deflection_deg", "sd_deg"))
+        table.add_row(method, *numbers, f"{row['truth_deg']:.2f}", f"{row['error_deg']:+.{places}f}", *beside)
     console.print(table)
     bet = result.bet
     parts = [
@@ -697,6 +698,7 @@ def demo(folder: Path, seed: int) -> None:
     picture = folder / "demo.png"
     draw(picture, figure_summary, bet, answers, truth_history(folder))
     print_score(result)
+    console.print(run_folder.best_in_words(answers), highlight=False)
     console.print(f"results, figures and report.html in {escape(str(written))}")
     console.print(f"the answer as a picture, with the truth: {escape(str(picture))}")
     console.print(f"{time.perf_counter() - begun:.0f} s in all")

@@ -116,6 +116,15 @@ class RunComparison(Tabular):
         independent = self.relations[number - 1].kind == INDEPENDENT
         return other - first, float(np.hypot(first_sd, other_sd)) if independent else np.nan, low, high
 
+    def size_in_sd(self, quantity: Quantity) -> float:
+        """Largest difference of any run to the first one over the larger sd of the two; 0 where none is known."""
+        sizes = [0.0]
+        for k in range(1, len(self.runs)):
+            change, sd = self.apart(k, quantity)[0], max(self.value(n, quantity)[1] for n in (0, k))
+            if np.isfinite(change) and sd > 0.0:
+                sizes.append(abs(change) / sd)
+        return max(sizes)
+
     def to_frame(self) -> pd.DataFrame:
         """One row a run: what it is, then each quantity with its sd, units in the columns' names."""
         rows = []

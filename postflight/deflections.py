@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress, Result, check_type, nearest_name, part_of
 from flightmodel.deflection import QUANTILE_COLUMNS, DeflectionHistory, cycle_about, mean_over
 from flightmodel.events import find_peak
+from flightmodel.statistics import decimals, pair
 from flightmodel.tabular import Tabular
 from postflight.flight import READ, RECONSTRUCT, Flight
 from postflight.methods import Inputs
@@ -190,10 +191,31 @@ class Deflections(Tabular):
         shown = []
         for method, history in self.continuous.items():
             theta, sd = np.rad2deg(history.angle_at(self.reference_s))
-            known = f"{theta:.2f} +/- {sd:.2f} deg" if np.isfinite(theta) else no_answer_at(history, self.reference_s)
+            known = (
+                f"{theta:.{decimals(sd)}f} +/- {sd:.{decimals(sd)}f} deg"
+                if np.isfinite(theta)
+                else no_answer_at(history, self.reference_s)
+            )
             shown.append(f"{method} {known}")
         answers = f"at {self.reference_s:.2f} s: {', '.join(shown) or 'no answer'}"
         return f"{self.doubt}; {answers}" if self.doubt else answers
+
+
+def said(row: Mapping[str, Any], at: str = "at peak q") -> dict[str, str]:
+    """Say a method's answer, deg: at peak q, cycle mean (where there is a clear cycle) and largest, by these names.
+
+    Every text, table and picture takes the numbers from here, each rounded to its standard deviation. ``row`` is one of
+    the methods in ``summary.json`` that has an answer; ``at`` names its moment where that is not the peak.
+    """
+    out = {at: pair(row["deflection_deg"], row["sd_deg"])}
+    if row.get("mean_deg") is not None:
+        out["cycle mean"] = pair(row["mean_deg"], row["mean_sd_deg"])
+    return out | {"largest": f"{row['largest_deg']:.{decimals(row['sd_deg'])}f}"}
+
+
+def headline(row: Mapping[str, Any], unit: str = "°", at: str = "at peak q") -> str:
+    """Say a method's answer in one line."""
+    return f"Deflection {', '.join(f'{name} {value}{unit}' for name, value in said(row, at).items())}"
 
 
 def borne_out(check: Check, agreement: Agreement) -> Check:

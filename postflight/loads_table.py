@@ -30,7 +30,8 @@ from flightmodel.atmosphere import sound_speed, us76
 from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.config import parse_section
 from flightmodel.deflection import lv_direction
-from flightmodel.tables import read_unit, to_si
+from flightmodel.tables import to_si
+from flightmodel.units import read_unit
 from flightmodel.vehicle import Vehicle, read_vehicle
 from postflight.intake.column_recognition import Recogniser, SourceProposal, column_unit
 from postflight.intake.freeform_tables import FreeFormTable

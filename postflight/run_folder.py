@@ -37,7 +37,7 @@ from flightmodel.earth import WGS84, name_of
 from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Telemetry
-from postflight.deflections import Deflections, no_answer_at, quantiles_at
+from postflight.deflections import Deflections, headline, no_answer_at, quantiles_at
 from postflight.flight import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.measurements import component_unit
@@ -286,6 +286,14 @@ def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any
             "applicable": reason.code != NO_VIDEO,
         }
     return out
+
+
+def best_in_words(answers: Deflections) -> str:
+    """Return the headline of the best answer; empty where no method answers at peak q."""
+    if answers.best is None:
+        return ""
+    row = method_summary(answers, answers.reference_s)[answers.best]
+    return f"{headline(row, at='at peak q' if answers.knows_peak else 'there')} ({answers.best})"
 
 
 def write_reconstruction(run: RunFolder, flight: Reconstruction, answers: Deflections | None = None) -> pd.DataFrame:

@@ -63,7 +63,7 @@ from scipy.special import logsumexp
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.earth import undulation_m
-from flightmodel.statistics import chi_square_quantile
+from flightmodel.statistics import chi_square_quantile, decimals, pair
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from postflight.intake.other_trajectory import OtherTrajectory
@@ -133,10 +133,9 @@ class FoundEffect:
     def words(self) -> str:
         """What differs and by how much, with the sd that the difference shows and the one that is stated."""
         parts = [
-            f"{name} {v:.{digits(s)}f} ± {s:.{digits(s)}f}".strip()
-            for name, v, s in zip(self.components, self.value, self.sd, strict=True)
+            f"{name} {pair(v, s)}".strip() for name, v, s in zip(self.components, self.value, self.sd, strict=True)
         ]
-        size = [f"together {np.linalg.norm(self.value):.{digits(self.sd.max())}f}"] if len(parts) > 1 else []
+        size = [f"together {np.linalg.norm(self.value):.{decimals(self.sd.max())}f}"] if len(parts) > 1 else []
         size += [f"{self.stated_size:.1f} sd by the covariances"] if np.isfinite(self.stated_size) else []
         return f"{_WORDS[self.name]} {', '.join(parts)} {self.unit}" + (f" ({'; '.join(size)})" if size else "")
 
@@ -237,11 +236,6 @@ class SystematicDifferences(Tabular):
 
     def _about(self) -> str:
         return f"{self.label}: {', '.join(e.name for e in self.effects) or 'no systematic difference'}"
-
-
-def digits(sd: float) -> int:
-    """Decimals in which a value with this sd is printed: two digits of the sd."""
-    return max(0, min(6, 1 - int(np.floor(np.log10(max(float(sd), 1e-6))))))
 
 
 def systematic_differences(

@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import json
 import re
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,7 @@ from pydantic import BaseModel
 from flightmodel import aerodynamics, tables
 from postflight import plots
 from postflight.cli import cli
+from postflight.deflections import headline, said
 from postflight.intake.flight_form import template_keys
 from postflight.montecarlo import study
 from synthetic_flight import dispersions, ensemble, instrument_errors, scenarios, weather
@@ -177,3 +179,27 @@ def test_page_of_codes_has_every_code_that_tests_expect():
 )
 def test_page_of_codes_says_what_the_message_says(code: str, words: str):
     assert words in message_codes().message_codes()[code]
+
+
+def demo_answers() -> dict[str, dict[str, float]]:
+    """Answers of the demo's flight by method, as the golden numbers keep them (`benchmarks/golden.py`)."""
+    stored = json.loads((ROOT / "benchmarks" / "golden" / "irve2_reference.json").read_text())
+    answers: dict[str, dict[str, float]] = {}
+    for column, (value,) in stored["run/summary"]["columns"].items():
+        first, _, rest = column.partition(".")
+        method, _, name = rest.partition(".")
+        if first == "methods":
+            answers.setdefault(method, {})[name] = value
+    return answers
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial-demo.md"])
+def test_the_demo_s_numbers_are_those_of_its_run(page: str) -> None:
+    """What documents show of the demo are the golden numbers of the same flight."""
+    text, answers = (ROOT / page).read_text(), demo_answers()
+    assert list(answers) == ["camera", "misalignment", "trim", "fused"]
+    for method, answer in answers.items():
+        cells = [cell.strip() for cell in re.search(rf"[│|] {method} +[│|](.*)", text)[1].replace("│", "|").split("|")]
+        assert " ± ".join(cells[:2]) == said(answer)["at peak q"]
+    if page == "README.md":
+        assert headline(answers["fused"]) in text

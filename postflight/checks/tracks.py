@@ -20,8 +20,8 @@ from flightmodel import earth, tables
 from flightmodel.checks import BoolArray, FloatArray, Issue
 from flightmodel.flightfolder import Sources
 from flightmodel.instruments import RADAR
-from flightmodel.tables import read_unit
 from flightmodel.telemetry import GnssRecord, RadarRecord, Telemetry
+from flightmodel.units import read_unit
 from postflight.checks.track_force import TrackForce, coasting, track_force
 from postflight.checks.units_and_axes import (
     TimeBias,

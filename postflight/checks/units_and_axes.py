@@ -14,7 +14,8 @@ from itertools import permutations, product
 import numpy as np
 
 from flightmodel.checks import FloatArray, Issue
-from flightmodel.tables import UNITS, Quantity, Source, place, read_unit
+from flightmodel.tables import Quantity, Source, place
+from flightmodel.units import UNITS, read_unit
 
 Axes = tuple[tuple[int, ...], tuple[int, ...]]
 AS_DECLARED: Axes = ((0, 1, 2), (1, 1, 1))

@@ -91,6 +91,11 @@ class TimeProposal:
     others: tuple[str, ...] = ()
     repeats: bool = False
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the unit or the offset of its seconds is asked for."""
+        return self.format == "seconds" and (not self.unit or self.offset_asked)
+
 
 @dataclass
 class SourceProposal:
@@ -156,15 +161,18 @@ def _band(kind: str, value: float) -> str:
 
 
 def add_clock_columns(table: FreeFormTable) -> None:
-    """Add columns for times of day and for seconds since 1970; each is noted in the table."""
+    """Add columns for times and seconds of day and for seconds since 1970; each is noted in the table."""
     for k, name in enumerate(list(table.names)):
         first = table.cells(k, 20)
+        words = re.findall(r"[a-z]+", name.lower())
         if first and all(_OF_DAY.match(c) for c in first):
             parts = [_OF_DAY.match(row[k]) if k < len(row) else None for row in table.rows]
             for number, short in enumerate(("h", "m", "s"), start=1):
                 _add(table, f"{name}_{short}", [m[number].replace(",", ".") if m else "" for m in parts])
             table.notes.append(f"times of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
-        elif first and set(re.findall(r"[a-z]+", name.lower())) & MARKS["since_1970"]:
+        elif first and ({"".join(words), *words} & MARKS["of_day"] or {"of", "day"} <= set(words)):
+            _add_seconds_of_day(table, k)
+        elif first and set(words) & MARKS["since_1970"]:
             values = table.numbers(k)
             first_s = np.nanmin(values, initial=np.inf)
             scale = next((s for s in (1.0, 1e-3, 1e-6) if 1e9 < first_s * s < 2.5e9), None)
@@ -173,6 +181,19 @@ def add_clock_columns(table: FreeFormTable) -> None:
                 iso = [f"{np.datetime64(int(s), 'us')}Z" if np.isfinite(s) else "" for s in stamps]
                 _add(table, f"{name}_utc", iso)
                 table.notes.append(f"seconds since 1970 in '{name}' became ISO UTC in {name}_utc")
+
+
+def _add_seconds_of_day(table: FreeFormTable, k: int) -> None:
+    """Add hour, minute and second where a column runs through seconds of one day, or of two."""
+    name, values = table.names[k], table.numbers(k)
+    known = values[np.isfinite(values)]
+    if not len(known) or known.min() < 0.0 or known.max() >= 2 * 86400.0:
+        return
+    of_day = np.round(values, 9) % 86400.0
+    parts = of_day // 3600.0, of_day % 3600.0 // 60.0, np.round(of_day % 60.0, 9)
+    for short, part in zip("hms", parts, strict=True):
+        _add(table, f"{name}_{short}", [f"{x:.11g}" if np.isfinite(x) else "" for x in part])
+    table.notes.append(f"seconds of day in '{name}' became columns {name}_h, {name}_m, {name}_s")
 
 
 def _add(table: FreeFormTable, name: str, cells: list[str]) -> None:

@@ -569,11 +569,16 @@ def _proposals(
         file = place.relative_to(folder).as_posix()
         if not found:
             unused_tables.append(_not_recognised(table, file))
+        asked = ""  # the section where this table's time is asked for
         for source in found:
             if source.section in taken:
                 words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
                 unused_tables.append(Issue(words, "given-twice"))
-            added.append(section_text(source, file, table.notes, source.section in taken))
+            time = source.time
+            is_open = time is not None and time is recogniser.time and time.is_open
+            added.append(section_text(source, file, table.notes, source.section in taken, asked if is_open else ""))
+            if is_open and source.section not in taken:
+                asked = asked or source.section
             taken.add(source.section)
     listed = "".join(added)
     added += [_without_list(v, folder) for v in came.videos if v.place.relative_to(folder).as_posix() not in listed]

@@ -26,7 +26,8 @@ from flightmodel.checks import ConfigError
 from flightmodel.config import FILL_IN_VALUE, read_toml
 from flightmodel.files import write_file
 from flightmodel.flightfolder import FlightFile
-from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES, UNITS
+from flightmodel.tables import ACCELEROMETER, ATMOSPHERE, BAROMETER, GNSS, MAGNETOMETER, RADAR, RATES
+from flightmodel.units import UNITS
 from flightmodel.vehicle import DATA, VehicleFile, vehicle_from_toml, vehicle_path
 from postflight.intake.column_recognition import (
     ASKED,
@@ -43,6 +44,7 @@ _EVERY_QUANTITY = (*ACCELEROMETER, *RATES, *MAGNETOMETER, *RADAR, *GNSS, *BAROME
 KINDS = ("flight", "vehicle", "scenario", "coefficients")
 _HEADER = re.compile(r"^(?:# )?\[\[?([\w.]+)\]\]?")
 _KEY = re.compile(r"^(?:# )?(\w+) = (.*?)\s+# (.*)$")
+_INERTIAL = {"sensors.accelerometer": "the accelerometer is", "sensors.rates": "the gyros are"}
 _WIDTH = 62  # of a line's value, before its comment
 _VEHICLE_LINE = '# vehicle = "vehicle/vehicle.toml"    #'
 console = terminal()
@@ -163,7 +165,7 @@ def _open_keys(value: Any, at: str) -> Iterator[str]:
 # proposals
 
 
-def section_text(source: SourceProposal, file: str, notes: list[str], taken: bool) -> str:
+def section_text(source: SourceProposal, file: str, notes: list[str], taken: bool, timed_as: str = "") -> str:
     """Return the TOML of one proposal.
 
     Parameters
@@ -175,11 +177,15 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
         What was changed in the file, as comments.
     taken : bool
         Whether flight.toml has that table already: all becomes comments below a question.
+    timed_as : str
+        Earlier section of the same file where the time is asked for; empty for none.
     """
     lines = [f"[{source.section}]"]
     lines += [f"# {note}" for note in notes]
     lines.append(f"file = {quoted(file)}")
-    if source.time is not None:
+    if timed_as:
+        lines.append(_line(f"time = {quoted(timed_as)}", "the same column, asked for there"))
+    elif source.time is not None:
         lines += _time_lines(source.time)
     lines += [_line(f"{key} = {value}", comment) for key, value, comment in source.keys]
     declared = [m for m in source.columns if not m.canonical]
@@ -210,12 +216,14 @@ def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[st
     if not tracked or "motion" in tables:
         return ""
     text = template("motion")
-    if not unrecognised:
+    missing = [words for s, words in _INERTIAL.items() if s not in sections]
+    if not unrecognised and len(missing) == len(_INERTIAL):
         return text
-    first = (
-        f"# QUESTION: {_one_line(', '.join(unrecognised))} may hold an accelerometer or gyros: declare the columns.\n"
-        "# Only a flight without both moves like this:\n"
-    )
+    first = f"# QUESTION: {missing[0]} missing; import the table.\n" if len(missing) == 1 else ""
+    if unrecognised:
+        names = _one_line(", ".join(unrecognised))
+        first += f"# QUESTION: {names} may hold an accelerometer or gyros: declare the columns.\n"
+    first += "# Only a flight without both moves like this:\n"
     return first + "".join(f"# {line}\n" for line in text.replace(FILL_IN_VALUE, "...").splitlines())
 
 
@@ -279,7 +287,7 @@ def _one_line(text: str) -> str:
 # the command
 
 
-def init(folder: Path, vehicle: str | None, no_vehicle: bool = False) -> None:
+def init(folder: Path, vehicle: str | None) -> None:
     """Write the forms of a new flight folder and print what comes next.
 
     Parameters
@@ -287,16 +295,15 @@ def init(folder: Path, vehicle: str | None, no_vehicle: bool = False) -> None:
     folder : Path
         Made where it does not exist.
     vehicle : str or None
-        Name of a shipped vehicle, path of a vehicle file (copied with its coefficient table), or None for a form.
-    no_vehicle : bool
-        Whether neither is written: a trajectory needs no vehicle.
+        Name of a shipped vehicle, path of a vehicle file (copied with its coefficient table), ``"form"`` for a form, or
+        None: a trajectory needs no vehicle.
 
     Raises
     ------
     ConfigError
         ``file-exists`` where a file would be overwritten, or what `flightmodel.vehicle` refuses.
     """
-    texts, copies = _contents(folder, vehicle, no_vehicle)
+    texts, copies = _contents(folder, vehicle)
     there = [path for path in (*texts, *copies) if path.exists()]
     if there:
         words = "exists already, and nothing is overwritten; name another folder"
@@ -314,15 +321,15 @@ def init(folder: Path, vehicle: str | None, no_vehicle: bool = False) -> None:
     console.print(following, highlight=False)
 
 
-def _contents(folder: Path, vehicle: str | None, no_vehicle: bool) -> tuple[dict[Path, str], dict[Path, Path]]:
+def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[Path, Path]]:
     """Texts to write and files to copy, by their paths."""
     flight = template("flight")
     texts = {folder / ".schema" / f"{kind}.json": schema_text(kind) for kind in ("flight", "vehicle")}
     copies: dict[Path, Path] = {}
-    if no_vehicle:
+    if vehicle is None:
         del texts[folder / ".schema" / "vehicle.json"]
         return texts | {folder / "flight.toml": flight}, copies
-    if vehicle is None:
+    if vehicle == "form":
         named = "vehicle/vehicle.toml"
         texts[folder / named] = template("vehicle")
     else:

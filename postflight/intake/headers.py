@@ -14,7 +14,7 @@ import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
 
-from flightmodel.tables import UNITS, read_unit
+from flightmodel.units import UNITS, read_unit
 
 _FOLD = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "µ": "u", "μ": "u", "²": "2", "³": "3", "⁻": "-"}

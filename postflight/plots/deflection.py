@@ -30,6 +30,7 @@ from postflight.plots.style import (
     with_holes,
 )
 from postflight.plots.subject import FUSE, Drawable, answers_of, bet_of, flow_of, fused_of, lacking, words_of
+from postflight.run_folder import best_in_words
 from postflight.runs import Run
 
 
@@ -77,7 +78,7 @@ def figure_summary(
     peak_s = float(air.time_s[np.nanargmax(air.dynamic_pressure_pa)]) if answers.bet is None else answers.bet.peak_s
     upper.axvline(peak_s, color=COLOUR["limit"], lw=0.8, ls=":")
     upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(air), ylim=(0, _top_deg(answers)))
-    legend_above(upper, 5, "bands: 1 sd; dotted: peak dynamic pressure")
+    legend_above(upper, 5, "bands: 1 sd; dotted: peak q")
     trajectory_angle(lower, air, "centerbody total angle of attack, 1 sd")
     lower.set(ylabel="angle of attack (deg)", xlabel=TIME)
     fit_height(lower, air)
@@ -86,7 +87,7 @@ def figure_summary(
     pressure.plot(air.time_s, air.dynamic_pressure_pa, color=COLOUR["prior"], lw=1)
     pressure.set(ylabel="dynamic pressure\n(Pa), grey", ylim=(0, None))
     pressure.grid(visible=False)
-    return titled(figure, "Deflection of the aeroshell by each method", words_of(flown))
+    return titled(figure, best_in_words(answers) or "Deflection of the aeroshell by each method", words_of(flown))
 
 
 @in_style

@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from flightmodel.checks import ConfigError, GateError, Issue
 from flightmodel.files import abandoned, partial_path, writing
+from flightmodel.statistics import decimals, pair
 from postflight.comparison import CORRELATED, Quantity, RunComparison, compare_runs
 from postflight.deflections import METHODS
 from postflight.plots.style import LABEL, MANY
@@ -25,7 +26,6 @@ from postflight.report.text import cell, date
 from postflight.report.write import charts, pulse_window, rendered
 from postflight.run_folder import DIGITS, answer_table, plain_text
 from postflight.runs import Run, find_run, is_complete, read_tables
-from postflight.systematic_differences import digits
 from postflight.terminal import terminal
 
 PAGE_NAME = "compare.html"
@@ -163,11 +163,13 @@ def print_comparison(compared: RunComparison) -> None:
         console.print(escape(f"{k}  {label}: {run.header['flight']}, {about}, run {run.path.name}"), highlight=False)
     t = compared.at_s
     when = f"at {t[0]:.2f} s, peak q of 1" if compared.same_clock else "each at its own peak q"
-    rows, count = value_rows(compared), len(compared.runs)
+    (rows, same), count = value_rows(compared), len(compared.runs)
     names = ["quantity", *(str(k + 1) for k in range(count))]
     console.table(f"Runs side by side, {when}; ± is 1 sd", names, [row[: count + 1] for row in rows])
     names = ["quantity", *(name for k in range(2, count + 1) for name in (f"{k} less 1", "its sd"))]
-    console.table("Differences", names, [[row[0], *row[count + 1 :]] for row in rows])
+    console.table("Differences, the largest in sd first", names, [[row[0], *row[count + 1 :]] for row in rows])
+    if same:
+        console.print(f"not moved: {', '.join(same)}")
     for k, relation in enumerate(compared.relations, 2):
         console.print(escape(f"{k} and 1: {relation.words}"), highlight=False)
     if any(relation.kind == CORRELATED for relation in compared.relations):
@@ -179,15 +181,22 @@ def print_comparison(compared: RunComparison) -> None:
         console.print(escape(words + (f"; failed: {', '.join(failed)}" if failed else "")), highlight=False)
 
 
-def value_rows(compared: RunComparison) -> list[list[str]]:
-    """Cells of the table of values: quantity, each run's value, then each difference and its sd or its bounds."""
-    rows = []
-    for q in compared.quantities:
-        cells = [_number(*compared.value(k, q)) for k in range(len(compared.runs))]
-        for k in range(1, len(compared.runs)):
-            cells += _apart(compared, k, q)
-        rows.append([f"{q.words} {q.unit}".strip(), *cells])
-    return rows
+def value_rows(compared: RunComparison) -> tuple[list[list[str]], list[str]]:
+    """Cells of the table of values, the largest change first, and the quantities that did not move.
+
+    A row has the quantity, each run's value, then each difference and its sd or its bounds. A quantity did not move
+    where every difference rounds to zero.
+    """
+    others = range(1, len(compared.runs))
+    rows, same = [], []
+    for q in sorted(compared.quantities, key=compared.size_in_sd, reverse=True):
+        apart = [cell for k in others for cell in _apart(compared, k, q)]
+        if all(change and float(change) == 0.0 for change in apart[::2]):
+            same.append(q.words)
+        else:
+            values = (_number(*compared.value(k, q)) for k in range(len(compared.runs)))
+            rows.append([f"{q.words} {q.unit}".strip(), *values, *apart])
+    return rows, same
 
 
 def _number(value: float, sd: float) -> str:
@@ -195,7 +204,7 @@ def _number(value: float, sd: float) -> str:
         return ""
     if not (np.isfinite(sd) and sd > 0.0):
         return f"{value:.2f}"
-    return f"{value:.{digits(sd)}f} ± {sd:.{digits(sd)}f}"
+    return pair(value, sd)
 
 
 def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str]:
@@ -205,7 +214,7 @@ def _apart(compared: RunComparison, number: int, quantity: Quantity) -> list[str
         return ["", ""]
     if not (np.isfinite(high) and high > 0.0):
         return [f"{change:+.2f}", ""]
-    shown = digits(high)
+    shown = decimals(high)
     spread = f"{sd:.{shown}f}" if np.isfinite(sd) else f"{low:.{shown}f} to {high:.{shown}f}"
     return [f"{change:+.{shown}f}", spread]
 
@@ -221,6 +230,7 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
     whole = [float(min(t.iloc[0] for t in spans)), float(max(t.iloc[-1] for t in spans))]
     panels = [*_deflection_panels(compared), *_trajectory_panels(compared)]
     data = charts(first, whole, pulse_window(bet), panels, studies=_difference_panels(compared, over_time))
+    rows, same = value_rows(compared)
     return rendered(
         "compare.html",
         data,
@@ -229,7 +239,8 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
         flights=sorted({run.header["flight"] for run in compared.runs}),
         synthetic=any(run.header["synthetic"] for run in compared.runs),
         date=date(first.header["epoch_utc"]),
-        values={"names": _value_names(compared), "rows": value_rows(compared), "more": 0},
+        values={"names": _value_names(compared), "rows": rows, "more": 0},
+        same=same,
         checks=_check_rows(compared),
         inputs=_input_rows(compared),
         correlated=any(relation.kind == CORRELATED for relation in compared.relations),

@@ -12,6 +12,7 @@ from rich.markup import escape
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.earth import require_earth
 from flightmodel.files import open_file
+from flightmodel.statistics import decimals
 from postflight.intake.other_trajectory import read_other
 from postflight.plots.style import COLOUR
 from postflight.report.panels import Panel, line_of, panel_of
@@ -19,7 +20,7 @@ from postflight.report.source import kept_rows, rounded
 from postflight.report.text import date
 from postflight.report.write import charts, rendered
 from postflight.runs import Run, trajectory_of
-from postflight.systematic_differences import SystematicDifferences, digits, systematic_differences
+from postflight.systematic_differences import SystematicDifferences, systematic_differences
 from postflight.terminal import terminal
 
 OTHER_TABLES = ("systematic_differences", "chi_square", "differences_over_time")
@@ -77,7 +78,14 @@ def _effect_cells(found: SystematicDifferences) -> tuple[list[str], list[list[st
     for r in found.to_frame().itertuples():
         allowed = f"{r.stated_sd:.2g}" if np.isfinite(r.stated_sd) else ""
         size = f"{r.stated_size:.1f}" if np.isfinite(r.stated_size) else ""
-        numbers = [f"{r.value:.{digits(r.sd)}f}", f"{r.sd:.2g}", allowed, r.unit, size, "yes" if r.beyond else "no"]
+        numbers = [
+            f"{r.value:.{decimals(r.sd)}f}",
+            f"{r.sd:.{decimals(r.sd)}f}",
+            allowed,
+            r.unit,
+            size,
+            "yes" if r.beyond else "no",
+        ]
         rows.append([r.effect, r.component, *numbers])
     return names, rows
 

@@ -5,7 +5,8 @@ A ± is one standard deviation; a card's intervals are quantiles: 16 to 84 and 5
 
 from __future__ import annotations
 
-import math
+import re
+from collections.abc import Iterable
 from datetime import timedelta
 from typing import Any
 
@@ -15,11 +16,14 @@ from scipy.special import ndtri
 
 from flightmodel.config import parse_utc
 from flightmodel.deflection import QUANTILES, interpolation_error, lateral_axes, lv_clock, lv_direction
-from postflight.deflections import METHODS
+from flightmodel.statistics import decimals, pair
+from flightmodel.tables import column_about
+from postflight.deflections import METHODS, headline, said
 from postflight.plots.style import COLOUR, LABEL
 from postflight.report.view_3d import best_method, hole_s
 from postflight.run_folder import answer_table
 from postflight.runs import Run
+from postflight.scoring import Score
 from postflight.sensitivity import largest_of_groups
 from recon.consistency import doubt
 
@@ -33,6 +37,8 @@ _BY = {"camera": "video alone", "misalignment": "the accelerometers alone", "tri
 _ALONE = {"state": "alone", "mark": "○", "remark": "no independent measurement to compare with"}
 NOT_ASKED = "not asked for in this run"
 SHOWN_ROWS = 200
+LISTS = ("camera_frames", "shell_shape")  # tables that are not printed: their CSV is for them
+_UNITS = {"deg": "deg", "m": "m", "mps": "m/s"}
 _NEAR_PEAK_S = 1.0  # window about the peak
 
 
@@ -48,15 +54,10 @@ def _utc(run: Run, time_s: float) -> str:
     return stamp.strftime("%H:%M:%S.") + f"{stamp.microsecond // 10000:02d}"
 
 
-def pair(value: float, sd: float) -> str:
-    """``4.9 ± 0.1`` with the digits that the sd deserves, in one piece."""
-    digits = max(0, min(4, -math.floor(math.log10(sd * 2.0)))) if sd > 0.0 else 2
-    return f"{value:.{digits}f}\u00a0±\u00a0{sd:.{digits}f}"
-
-
 def title(run: Run) -> str:
-    """Return the answer in one sentence, which begins with its doubt where checks fail."""
-    return f"In doubt: {_answer(run)}" if _doubt(run) else _answer(run)
+    """Return the answer in one line, which begins with its doubt where checks fail."""
+    words = f"In doubt: {_answer(run)}" if _doubt(run) else _answer(run)
+    return re.sub(r" (?=[±\d]|mean|q\b)", "\u00a0", words)  # no line ends between a name and its number
 
 
 def _doubt(run: Run) -> str:
@@ -68,11 +69,7 @@ def _answer(run: Run) -> str:
     best = best_method(run)
     if best is not None:
         answer = run.summary["methods"][best]
-        by = "" if best == "fused" else f", by {_BY[best]}"
-        if answer.get("mean_deg") is not None:
-            mean = pair(answer["mean_deg"], answer["mean_sd_deg"])
-            return f"Deflection {mean}° on average over a cycle, {answer['largest_deg']:.1f}° at most{by}"
-        return f"Deflection {pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}{by}"
+        return headline(answer, at=f"at {_peak_name(run)}") + ("" if best == "fused" else f", by {_BY[best]}")
     asked = run.facts["settings"]["methods"]
     end = "no method gave a deflection" if asked else "no deflection was asked for"
     highest = run.peak("altitude")
@@ -82,9 +79,9 @@ def _answer(run: Run) -> str:
 
 
 def _peak_name(run: Run) -> str:
-    """Peak dynamic pressure, or the largest there is where the data end before the peak."""
+    """Peak q, or the largest there is where the data end before the peak."""
     row = run.peak("dynamic pressure")
-    return "peak dynamic pressure" if row is None or bool(row["inside"]) else "the largest dynamic pressure in the data"
+    return "peak q" if row is None or bool(row["inside"]) else "the largest q in the data"
 
 
 def lead(run: Run) -> list[str]:
@@ -92,35 +89,44 @@ def lead(run: Run) -> list[str]:
     s = run.summary
     at = s["peak_dynamic_pressure_s"]
     row = run.peak("dynamic pressure")
-    sd = f" ± {row['sd']:.0f}" if row is not None and np.isfinite(row["sd"]) else ""
+    pressure = f"{s['peak_dynamic_pressure_pa']:.0f}"
+    if row is not None and np.isfinite(row["sd"]):
+        pressure = pair(s["peak_dynamic_pressure_pa"], row["sd"])
     events = run.tables["events"]
     there = events.iloc[int((events["t_s"] - at).abs().argmin())]
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
     out.append(
-        f"{_peak_name(run).capitalize()}: {s['peak_dynamic_pressure_pa']:.0f}{sd} Pa at {at:.2f} s "
+        f"{_peak_name(run).capitalize()}, the dynamic pressure: {pressure} Pa at {at:.2f} s "
         f"({_utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
     )
     out[0:0] = [words for words in (_oscillation(run), _outside_its_inputs(run)) if words]
     out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
-    rests = _rests_on(s.get("rests_on") or [])  # runs of before have none
-    if rests:
-        out.append(f"{rests[0].upper()}{rests[1:]}.")
     if run.changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(run.changes)}.")
     return [f"{doubtful}.", *out] if (doubtful := _doubt(run)) else out
 
 
-def _rests_on(lines: list[str]) -> str:
-    """What the answer rests on, in one sentence that says once whose uncertainty is not stated."""
-    unknown = " (uncertainty not stated)"
-    bare = [line.removesuffix(unknown) for line in lines if line.endswith(unknown)]
-    stated = [line for line in lines if not line.endswith(unknown)]
-    last = [f"{'; '.join(bare)} (uncertainties not stated)"] if len(bare) > 1 else [line + unknown for line in bare]
-    return "; ".join([*stated, *last])
+def rests_on(lines: Iterable[str]) -> list[list[str]]:
+    """Absolute values, each beside what it depends on and no residual shows: rows of a table, of ``rests_on``."""
+    return [re.split(r" rests? on (?:the )?", line, maxsplit=1) for line in lines]
+
+
+def against_truth(score: Score) -> dict[str, Any]:
+    """Every quantity that is scored: estimate, truth, error, sd, and the error over the sd."""
+    rows = []
+    for of in score.scored:
+        places = decimals(of.sd)
+        answered, trajectory = np.isfinite(of.error), not np.isfinite(of.truth)
+        name = f"{of.name.replace('_', ' ')}, rms over the pulse" if trajectory else f"deflection at peak q, {of.name}"
+        truth = "" if trajectory else f"{of.truth:.2f}"
+        estimate = f"{of.truth + of.error:.{places}f}" if answered and not trajectory else ""
+        numbers = (f"{of.error:+.{places}f}", f"{of.sd:.{places}f}", f"{of.error / of.sd:+.1f}")
+        rows.append([name, _UNITS[of.unit], estimate, truth, *(numbers if answered else ("no answer", "", ""))])
+    return {"names": ["quantity", "unit", "estimate", "truth", "error", "1 sd", "error / sd"], "rows": rows, "more": 0}
 
 
 def _oscillation(run: Run) -> str:
-    """Sentence on a deflection that oscillates around the peak; empty where one number describes it."""
+    """Sentence on the cycle of a deflection that oscillates around the peak; empty where one number describes it."""
     best = best_method(run)
     if best is None:
         return ""
@@ -128,16 +134,17 @@ def _oscillation(run: Run) -> str:
     if answer.get("mean_deg") is not None:
         first, last = answer["mean_over_s"]
         return (
-            f"{pair(answer['deflection_deg'], answer['sd_deg'])}° at {_peak_name(run)}; the mean is that of the cycle "
-            f"about it, {first:.2f} to {last:.2f} s, the largest at {answer['largest_at_s']:.2f} s."
+            f"The deflection oscillates. Its cycle around {_peak_name(run)} lasts from {first:.2f} to {last:.2f} s, "
+            f"and it is largest at {answer['largest_at_s']:.2f} s."
         )
     near = table["theta_deg"][(table["t_s"] - run.summary["peak_dynamic_pressure_s"]).abs() < _NEAR_PEAK_S]
     # a range that one number describes
     if len(near) < 2 or near.max() - near.min() < 4.0 * answer["sd_deg"]:
         return ""
+    places = decimals(answer["sd_deg"])
     return (
-        f"It oscillates between {near.min():.1f} and {near.max():.1f}° within {_NEAR_PEAK_S:.0f} s of that time; "
-        f"largest {answer['largest_deg']:.1f}° at {answer['largest_at_s']:.2f} s."
+        f"The deflection oscillates between {near.min():.{places}f} and {near.max():.{places}f}° within "
+        f"{_NEAR_PEAK_S:.0f} s of {_peak_name(run)}, and it is largest at {answer['largest_at_s']:.2f} s."
     )
 
 
@@ -172,10 +179,12 @@ def _card(run: Run, method: str) -> dict[str, Any]:
     value, sd = answer["deflection_deg"], answer["sd_deg"]
     # runs of before the quantiles have a sd alone
     quantiles = answer.get("quantiles_deg") or [max(value + k * sd, 0.0) for k in ndtri(QUANTILES)]
+    (at, here), *others = said(answer, f"at {_peak_name(run)}").items()
+    places = decimals(sd)
     card |= {
-        "value": f"{value:.2f}", "sd": f"{sd:.2f}", "number": value, "number_sd": sd,
-        "low": f"{quantiles[0]:.2f}", "high": f"{quantiles[-1]:.2f}", "quantiles": quantiles,
-        "plane": plane_at(run, method), "largest": f"{answer['largest_deg']:.2f}", "largest_s": answer["largest_at_s"],
+        "at": at, "value": here.split(" ± ")[0], "sd": here.split(" ± ")[1], "others": others, "number": value,
+        "low": f"{quantiles[0]:.{places}f}", "high": f"{quantiles[-1]:.{places}f}", "quantiles": quantiles,
+        "plane": plane_at(run, method), "largest_s": answer["largest_at_s"],
         "assumptions": answer["assumptions"],
     }  # fmt: skip
     card |= _agreement(run, method)
@@ -223,8 +232,7 @@ def plane_at(run: Run, method: str) -> str:
     clock = lv_clock(here)
     missed = interpolation_error(t, yz @ lateral_axes(clock)[1], at) / np.linalg.norm(here)
     clock, sd = np.rad2deg(clock), float(np.hypot(sd, np.rad2deg(missed)))
-    places = 0 if sd >= 1.0 else 1
-    return f"{float(clock):.{places}f} ± {sd:.{places}f}"
+    return pair(float(clock), sd)
 
 
 def with_whiskers(shown: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -266,23 +274,45 @@ def events(run: Run) -> list[dict[str, Any]]:
     rows = []
     for k, e in enumerate(run.tables["events"].itertuples(index=False), 1):
         shown = {
-            "altitude": (e.alt_m / 1e3, e.alt_3sd_m / 1e3, 3), "speed": (e.speed_ground_mps, e.speed_ground_3sd_mps, 2),
-            "mach": (e.mach, e.mach_3sd, 3), "pressure": (e.dynamic_pressure_pa, e.dynamic_pressure_3sd_pa, 1),
-            "alpha": (e.alpha_total_wind_deg, e.alpha_total_wind_3sd_deg, 2),
+            "altitude": (e.alt_m / 1e3, e.alt_3sd_m / 1e3), "speed": (e.speed_ground_mps, e.speed_ground_3sd_mps),
+            "mach": (e.mach, e.mach_3sd), "pressure": (e.dynamic_pressure_pa, e.dynamic_pressure_3sd_pa),
+            "alpha": (e.alpha_total_wind_deg, e.alpha_total_wind_3sd_deg),
         }  # fmt: skip
-        cells = {
-            name: f"{x:.{digits}f} ± {three_sd / 3.0:.{digits}f}" if np.isfinite(x) else "not known"
-            for name, (x, three_sd, digits) in shown.items()
-        }
+        cells = {k: pair(x, three_sd / 3.0) if np.isfinite(x) else "not known" for k, (x, three_sd) in shown.items()}
         rows.append({"number": k, "name": e.event, "t": f"{e.t_s:.2f}", "utc": _utc(run, e.t_s)} | cells)
     return rows
 
 
+def main_columns(table: pd.DataFrame) -> pd.DataFrame:
+    """Table without what its CSV alone needs: preflight values, correlations, and times beside Mach numbers."""
+    aside = r"correlation_c|.*_preflight$|alpha_shell_deg$" + ("|t_s$" if "mach" in table else "")
+    return table[[name for name in table if not re.match(aside, str(name))]]
+
+
 def table_rows(table: pd.DataFrame) -> dict[str, Any]:
-    """Column names and cells of a small table, and how many rows are left out."""
+    """Column names and cells of a small table, and how many rows are left out; a value stands with its sd."""
     shown = table.head(SHOWN_ROWS)
-    cells = [[cell(x) for x in row] for row in shown.itertuples(index=False)]
-    return {"names": [str(n).replace("_", " ") for n in table.columns], "rows": cells, "more": len(table) - len(shown)}
+    sds = {name: sd for name in table for sd in (_sd_column(str(name)),) if sd in table}
+    columns = {
+        str(name).replace("_", " "): [
+            pair(x, sd) if np.isfinite(x) and np.isfinite(sd) else cell(x)
+            for x, sd in zip(shown[name], shown[sds[name]], strict=True)
+        ]
+        if name in sds
+        else [cell(x) for x in shown[name]]
+        for name in table
+        if name not in sds.values()
+    }
+    return {
+        "names": list(columns),
+        "rows": list(map(list, zip(*columns.values(), strict=True))),
+        "more": len(table) - len(shown),
+    }
+
+
+def _sd_column(name: str) -> str:
+    """Column that would hold the standard deviation of another one."""
+    return "sd" if name in ("estimate", "value") else column_about(name)
 
 
 def sensitivity_rows(table: pd.DataFrame) -> dict[str, Any]:

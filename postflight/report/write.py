@@ -39,6 +39,7 @@ from postflight.report.panels import (
 )
 from postflight.report.source import rounded
 from postflight.runs import Run, read_run
+from postflight.scoring import Score, score_run
 
 _NAME = "report.html"
 SCRIPTS = ("time.js", "uPlot.iife.min.js", "charts.js", "vehicle.js", "film.js", "start.js")
@@ -71,7 +72,8 @@ def write_report(
 ) -> Path:
     """Write the report of a run (`read_run`) to ``target`` or into the run's folder; return where it lies.
 
-    ``studies`` are folders or files with bands that the flight is held against (`postflight.report.panels`).
+    ``studies`` are folders or files with bands that the flight is held against (`postflight.report.panels`). The truth
+    of a synthetic flight stands beside the finished estimates, by `postflight.scoring`.
 
     Raises
     ------
@@ -80,7 +82,8 @@ def write_report(
     """
     run = read_run(flight_folder, path, flight)
     target = run.path / _NAME if target is None else target
-    write_whole(target, page(run, studies))
+    has_truth = (flight_folder / "truth" / "truth.csv").is_file()
+    write_whole(target, page(run, studies, score_run(flight_folder, run.path) if has_truth else None))
     return target
 
 
@@ -90,8 +93,8 @@ def write_whole(target: Path, content: str) -> None:
         write_file(target, content)
 
 
-def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
-    """Return the whole page."""
+def page(run: Run, studies: tuple[Path, ...] = (), score: Score | None = None) -> str:
+    """Return the whole page, with the errors of a run that was scored."""
     frames, worst = _film(run)
     data, absent = _numbers(run, frames, studies)
     return rendered(
@@ -102,6 +105,7 @@ def page(run: Run, studies: tuple[Path, ...] = ()) -> str:
         worst=worst,
         absent=absent,
         studies=[path.resolve().name for path in studies],
+        against_truth=None if score is None else text.against_truth(score),
         **_texts(run),
     )
 
@@ -162,10 +166,15 @@ def _texts(run: Run) -> dict[str, Any]:
         "lead": text.lead(run),
         "cards": text.with_whiskers(text.cards(run)),
         "clock": text.clock_drawing(run),
+        "rests_on": text.rests_on(run.summary.get("rests_on") or []),  # runs of before have none
         "events": text.events(run),
         "findings": text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
         "checks": text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
-        "extra": [(title, text.table_rows(run.tables[name])) for name, title in more.items() if name in run.tables],
+        "extra": [
+            (title, f"{name}.csv" if name in text.LISTS else "", text.table_rows(text.main_columns(run.tables[name])))
+            for name, title in more.items()
+            if name in run.tables
+        ],
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],

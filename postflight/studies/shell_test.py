@@ -33,7 +33,8 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
-from flightmodel.tables import line_of, numbers, read_table, read_unit
+from flightmodel.tables import line_of, numbers, read_table
+from flightmodel.units import read_unit
 
 LABEL = "load test"
 LAWS: tuple[tuple[str, ...], ...] = ((), ("hardening",), ("creep",), ("creep", "hardening"))

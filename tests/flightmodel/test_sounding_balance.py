@@ -5,7 +5,7 @@ import pytest
 
 from flightmodel.atmosphere import R_AIR_JPKGK, us76
 from flightmodel.sensor_tables import HYDROSTATIC_TOLERANCE, hydrostatic_error
-from flightmodel.tables import UNITS
+from flightmodel.units import UNITS
 
 
 def read_as(temperature_k, true, declared):

@@ -1,9 +1,12 @@
 """Units: every short name against a library of units, other texts through it, and what is no unit of a table."""
 
+import numpy as np
 import pint
 import pytest
 
-from flightmodel.tables import UNITS, read_unit
+from flightmodel.checks import ConfigError
+from flightmodel.config import Section, parse_section
+from flightmodel.units import UNITS, read_unit
 
 PINT = pint.UnitRegistry()
 IN_PINT = {
@@ -61,3 +64,45 @@ def test_other_texts_are_read(text, kind, factor):
 )  # fmt: skip
 def test_what_is_no_unit_of_a_table_is_not_read(text):
     assert read_unit(text) is None
+
+
+class DataSheet(Section):
+    """Keys whose names end with a unit, as those of flight.toml."""
+
+    bias_sd_mps2: float = 0.0
+    noise_sd_deg: tuple[float, float] | float = 0.0
+    mount_k: float = 0.0
+    mass_kg: float = 0.0
+    rows: int = 0
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "number"),
+    [
+        ("bias_sd_mps2", "4 mg", 4e-3 * 9.80665), ("bias_sd_mps2", "3e-2 ft/s^2", 3e-2 * 0.3048),
+        ("noise_sd_deg", "1 mrad", np.rad2deg(1e-3)), ("noise_sd_deg", "30 arcmin", 0.5),
+        ("mount_k", "20 degC", 293.15), ("mount_k", "20 K", 20.0),
+    ],
+)  # fmt: skip
+def test_a_data_sheet_s_value_takes_its_unit(key, text, number):
+    assert getattr(parse_section(DataSheet, {key: text}, "sheet"), key) == pytest.approx(number, rel=1e-12)
+
+
+def test_a_list_takes_units_too():
+    sheet = parse_section(DataSheet, {"noise_sd_deg": ["0.1 deg", 0.2]}, "sheet")
+    assert sheet.noise_sd_deg == pytest.approx((0.1, 0.2))
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        {"bias_sd_mps2": "4 kg"},
+        {"bias_sd_mps2": "4"},
+        {"bias_sd_mps2": "4 furlongs?"},
+        {"mass_kg": "much"},
+        {"rows": "4"},
+    ],
+)
+def test_a_value_with_another_unit_or_none_is_refused(stated):
+    with pytest.raises(ConfigError):
+        parse_section(DataSheet, stated, "sheet")

@@ -100,3 +100,13 @@ def test_commands_on_a_read_only_machine(tmp_path, flight, command):
     )  # fmt: skip
     assert "Traceback" not in done.stderr
     assert done.returncode == (0 if command == ["check"] else 3), done.stderr
+
+
+def test_without_the_bench_s_library_every_other_command_is_there(tmp_path):
+    """Werkzeug serves the film's page alone; without it the command says how to install it."""
+    absent = "import sys; sys.modules['werkzeug'] = None; from postflight.cli import main; "
+    done = run([], f"{absent}sys.argv[1:] = ['camera', {str(tmp_path)!r}]; main()")
+    assert (done.returncode, printed_codes(done.stderr)) == (2, ["package-missing"])
+    assert "postflight[bench]" in done.stderr
+    done = run([], f"{absent}import postflight.commands, postflight.report.write; sys.argv[1:] = ['--help']; main()")
+    assert done.returncode == 0, done.stderr

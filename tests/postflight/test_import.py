@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import read_flight, read_sources
-from flightmodel.tables import read_unit
+from flightmodel.units import read_unit
 from postflight.cli import cli
 
 ROOT = Path(__file__).parents[2]

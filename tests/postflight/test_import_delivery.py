@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
+from flightmodel.flightfolder import FlightFile
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from postflight.cli import cli
 from tests.refusing import numbers_in, printed_codes
@@ -33,7 +34,7 @@ def read(folder):
 
 @pytest.fixture
 def folder(tmp_path):
-    run("init", tmp_path / "flight")
+    run("init", tmp_path / "flight", "--vehicle", "form")
     return tmp_path / "flight"
 
 
@@ -81,7 +82,7 @@ def test_ballistic_is_proposed_only_where_no_column_may_be_an_accelerometer(fold
     run("import", radar(tmp_path / "radar.csv"), triad(tmp_path / "suba.csv", ["QX", "QY", "QZ"]), "--into", folder)
     assert "motion" not in read(folder)
     assert "# QUESTION: suba " in (folder / "flight.toml").read_text()
-    run("init", tmp_path / "other")
+    run("init", tmp_path / "other", "--vehicle", "form")
     run("import", tmp_path / "radar.csv", "--into", tmp_path / "other")
     assert read(tmp_path / "other")["motion"]["model"] == "ballistic"
     later = [
@@ -92,6 +93,54 @@ def test_ballistic_is_proposed_only_where_no_column_may_be_an_accelerometer(fold
     text = (tmp_path / "other" / "flight.toml").read_text()
     assert "# QUESTION: [motion] " in text
     assert "attitude_prior" in read(tmp_path / "other")
+
+
+def test_gyros_without_an_accelerometer_leave_it_missing_and_propose_no_motion(folder, tmp_path):
+    rates = triad(tmp_path / "gyro.csv", ["p (deg/s)", "q (deg/s)", "r (deg/s)"])
+    run("import", radar(tmp_path / "radar.csv"), rates, "--into", folder)
+    assert "motion" not in read(folder)
+    assert "# QUESTION: the accelerometer is missing" in (folder / "flight.toml").read_text()
+
+
+def one_logger(path, time, times):
+    """A table of five sources with one column of times."""
+    rng = np.random.default_rng(3)
+    names = [*(f"A{a} [g]" for a in "XYZ"), *(f"{a} (deg/s)" for a in "pqr"), *(f"Mag{a} (uT)" for a in "XYZ")]
+    table = pd.DataFrame(rng.normal(size=(N, 9)), columns=names).assign(**{"alt baro (m)": 1e3 - T, time: times})
+    table.assign(lat_deg=37.0 + T / 1e3, lon_deg=-75.0, **{"gps height (m)": 1e3 - T}).to_csv(path, index=False)
+    return path
+
+
+def test_the_unit_of_one_column_of_times_is_asked_once(folder, tmp_path):
+    run("import", one_logger(tmp_path / "log.csv", "time", np.arange(N)), "--into", folder)
+    found = read(folder)
+    entries = {f"{g}.{k}": e for g in ("sensors", "gnss", "barometers") for k, e in found.get(g, {}).items()}
+    times = [entry["time"] for entry in entries.values()]
+    assert len(times) >= 4
+    (asked,) = [time for time in times if isinstance(time, dict)]
+    assert asked["unit"] == "FILL IN"
+    assert {time for time in times if time is not asked} == {next(k for k, e in entries.items() if e["time"] is asked)}
+    asked["unit"] = "ms"
+    filled = json.loads(json.dumps(found).replace('"FILL IN"', '"ellipsoid"'))
+    filled |= {"name": "x", "t0_utc": "2020-01-01T00:00:00Z", "attitude_prior": None}
+    for mounted in filled["sensors"].values():
+        mounted.pop("mount", None)
+    read_back = FlightFile.model_validate(filled)
+    assert {source.time.unit for source in read_back.sources} == {"ms"}
+
+
+@pytest.mark.parametrize("name", ["SOD", "SOD (s)", "seconds of day", "time_of_day (s)"])
+def test_seconds_of_day_become_hour_minute_and_second(name, folder, tmp_path):
+    """From 20 s before midnight: the reader counts on into the next day."""
+    seconds = 86380.0 + 1.25 * np.arange(N)
+    path = one_logger(tmp_path / "log.csv", name, np.where(seconds < 86400.0, seconds, seconds - 86400.0))
+    run("import", path, "--into", folder)
+    times = {json.dumps(entry["time"]) for entry in read(folder)["sensors"].values()}
+    ((time,),) = [[json.loads(text) for text in times]]
+    assert time["format"] == "utc_hms"
+    table = pd.read_csv(folder / "telemetry" / "log.csv")
+    h, m, s = (table[column] for column in time["columns"])
+    np.testing.assert_allclose((3600.0 * h + 60.0 * m + s - seconds) % 86400.0, 0.0, atol=1e-9)
 
 
 # video
@@ -138,7 +187,7 @@ def test_list_after_pictures_a_film_and_the_only_camera(tmp_path):
     frames = read(folder)["frames"]
     assert (frames["folder"], frames["camera"]) == ("telemetry/cam", "FILL IN")
     assert re.search(r"\ncamera = .*\bcamera5_uncalibrated, camera5\b", (folder / "flight.toml").read_text())
-    run("init", tmp_path / "b")
+    run("init", tmp_path / "b", "--vehicle", "form")
     with (tmp_path / "b" / "vehicle" / "vehicle.toml").open("a") as form:
         form.write("\n[cameras.aft]\n")
     (tmp_path / "onboard.webm").write_bytes(b"\x1aE\xdf\xa3 no matter")

@@ -20,7 +20,7 @@ CLOCK = {"hour": 18, "minute": 54, "second": SECOND}
 
 @pytest.fixture
 def folder(tmp_path):
-    CliRunner().invoke(cli, ["init", str(tmp_path / "flight"), "--no-vehicle"])
+    CliRunner().invoke(cli, ["init", str(tmp_path / "flight")])
     return tmp_path / "flight"
 
 

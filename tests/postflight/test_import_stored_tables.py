@@ -34,7 +34,7 @@ ANSWERS = {"latitude_deg": 37.8, "longitude_deg": -75.5, "height_m": 10.0}
 
 @pytest.fixture
 def folder(tmp_path):
-    CliRunner().invoke(cli, ["init", str(tmp_path / "flight"), "--no-vehicle"])
+    CliRunner().invoke(cli, ["init", str(tmp_path / "flight")])
     return tmp_path / "flight"
 
 

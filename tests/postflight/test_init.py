@@ -118,7 +118,7 @@ def test_template_names_every_setting_of_the_reconstruction_with_its_default():
 
 
 def test_new_folder_says_what_is_still_to_fill_in(tmp_path):
-    made = run("init", tmp_path / "flight")
+    made = run("init", tmp_path / "flight", "--vehicle", "form")
     assert made.exit_code == 0, made.output
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
     assert found["exit_code"] == 2
@@ -137,16 +137,15 @@ def test_new_folder_says_what_is_still_to_fill_in(tmp_path):
 
 
 def test_a_folder_for_the_trajectory_alone_has_no_vehicle(tmp_path):
-    made = run("init", tmp_path / "flight", "--no-vehicle")
+    made = run("init", tmp_path / "flight")
     assert made.exit_code == 0, made.output
     assert not (tmp_path / "flight" / "vehicle").exists()
     found = json.loads(run("check", tmp_path / "flight", "--json").stdout)
     assert [w.split("'")[1] for w in found["fill_in"]] == ["name", "t0_utc"]
-    assert run("init", tmp_path / "other", "--no-vehicle", "--vehicle", "irve2_reference").exit_code == 2
 
 
 def test_filled_in_vehicle_form_is_a_vehicle(tmp_path):
-    run("init", tmp_path / "flight")
+    run("init", tmp_path / "flight", "--vehicle", "form")
     path = tmp_path / "flight" / "vehicle" / "vehicle.toml"
     given = tomllib.loads((ROOT / "examples" / "own_vehicle" / "vehicle.toml").read_text())
     table, out = given, []

@@ -46,7 +46,7 @@ def flight(tmp_path):
         answer = {"t_s": T, "theta_deg": 2.0 + error, "plane_lv_deg": 0.0 * T, "theta_sd_deg": sd + 0.0 * T}
         pd.DataFrame(answer).to_csv(run / "deflection_trim.csv", index=False)
         others = {name: {"applicable": False, "reason": "-"} for name in OTHERS}
-        (run / "summary.json").write_text(json.dumps({"methods": others}))
+        (run / "summary.json").write_text(json.dumps({"methods": others, "peak_dynamic_pressure_s": 10.0}))
         (run / "bet_header.json").write_text(json.dumps({"vehicle": {"name": vehicle}}))
         (run / "run.json").write_text(json.dumps({"settings": {}}))
         return score_run(tmp_path, run, Limits(**{"without": OTHERS} | limits))

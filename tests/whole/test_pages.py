@@ -98,13 +98,13 @@ NOT_RUN |= dict.fromkeys(
 )
 # blocks that are no commands, or not those alone, by their first line
 SHOWN = (
-    "Deflection at the true peak of dynamic pressure", "my-flight/",
+    "Deflection at peak q", "my-flight/",
     "export DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION", "docker build",
 )  # fmt: skip
 # what a command leaves, beside its exit code
 WRITES = {
     "postflight demo demo-flight": "demo-flight/demo.png demo-flight/runs/*/report.html",
-    "postflight init my-flight": "my-flight/flight.toml my-flight/vehicle/vehicle.toml",
+    "postflight init my-flight --vehicle form": "my-flight/flight.toml my-flight/vehicle/vehicle.toml",
     "postflight import delivered/* --into my-flight": "my-flight/telemetry/*.csv my-flight/telemetry/*/*.png",
     "postflight run my-flight": "my-flight/runs/*/deflection_fused.csv my-flight/runs/*/figures/*.png",
     "postflight export my-flight --to nc": "my-flight/exports/*.nc",
@@ -325,6 +325,7 @@ def as_shown(printed: str) -> None:
         )
         assert shown == pytest.approx(ours, abs=0.011)
         assert told == pytest.approx(ours, abs=0.011)
+    assert re.search(r"Deflection at peak q .* \(fused\)", printed)[0] in readme
 
 
 # ------------------------------------------------------------------------------------------------------- the lists
@@ -334,7 +335,7 @@ def as_shown(printed: str) -> None:
 def test_what_the_readme_shows_is_printed(short: Path, capsys, monkeypatch) -> None:
     printed = runner(capsys, monkeypatch)("score", short, cwd=short.parent).stdout.splitlines()
     shown = (ROOT / "README.md").read_text().splitlines()
-    for mark in ("┃ method", "Deflection at the true peak of dynamic pressure ("):
+    for mark in ("┃ method", "Deflection at peak q ("):
         (ours,), (theirs,) = ([line for line in text if line.lstrip().startswith(mark)] for text in (printed, shown))
         assert re.sub(r"[\d.]+ s\)", "s)", ours.strip()) == re.sub(r"[\d.]+ s\)", "s)", theirs)
 

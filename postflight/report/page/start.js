@@ -1,4 +1,4 @@
-// Starts all parts; for print, details open and charts take the width of a page.
+// Starts all parts; for print, details open (but no long lists) and charts take the width of a page.
 
 startControls();
 const fitCharts = startCharts();
@@ -9,7 +9,7 @@ clock.show(clock.from, clock.to);
 
 const SHEET = 690, opened = [];
 window.addEventListener("beforeprint", () => {
-  for (const part of document.querySelectorAll("details:not([open])")) {
+  for (const part of document.querySelectorAll("details:not([open]):not(.listed)")) {
     part.open = true;
     opened.push(part);
   }

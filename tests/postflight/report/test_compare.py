@@ -19,7 +19,7 @@ from flightmodel.checks import ConfigError, GateError
 from postflight import commands
 from postflight.comparison import CORRELATED, INDEPENDENT, Quantity, compare_runs, sd_bounds
 from postflight.report import compare
-from postflight.report.compare import PAGE_NAME, TABLES
+from postflight.report.compare import PAGE_NAME, TABLES, value_rows
 from postflight.runs import find_run, read_tables
 from tests.in_process import runner
 from tests.postflight.report.conftest import HOSTILE
@@ -279,3 +279,14 @@ def test_the_terminal_names_the_changes_and_bounds(flown, tmp_path, capsys, monk
     assert table["dynamic_pressure_difference_pa"][0] < 0.0  # the flight's last run is the what-if, and stands first
     with pytest.raises(GateError):
         find_run(flown, "no-such")
+
+
+def test_the_largest_change_stands_first_and_what_did_not_move_is_only_named(entry):
+    """1 deg of the trim and 20 Pa: two sd and half of one; nothing else moves."""
+    bet = entry.tables["bet"].assign(dynamic_pressure_pa=lambda table: table["dynamic_pressure_pa"] + 20.0)
+    trim = entry.tables["deflection_trim"].assign(theta_deg=lambda table: table["theta_deg"] + 1.0)
+    compared = compare_runs((entry, moved(entry, bet=bet, deflection_trim=trim)))
+    rows, same = value_rows(compared)
+    assert [row[0] for row in rows] == ["deflection: trim deg", "dynamic pressure Pa"]
+    assert {"Mach number", "deflection: camera", "largest: fused"} <= set(same)
+    assert len(rows) + len(same) == len(compared.quantities)

@@ -15,6 +15,8 @@ import pytest
 
 from flightmodel.checks import GateError
 from flightmodel.deflection import lv_clock
+from flightmodel.statistics import decimals, pair
+from postflight.commands import console, print_answers
 from postflight.plots.style import COLOUR, with_holes
 from postflight.report import pictures
 from postflight.report import text as texts
@@ -22,6 +24,7 @@ from postflight.report.panels import trajectory_panels, trajectory_rows
 from postflight.report.source import extreme_rows, kept_rows, rounded
 from postflight.report.write import SCRIPTS, STYLES, page, safe_json, write_report
 from postflight.runs import read_run, read_tables
+from postflight.scoring import score_run
 from recon.consistency import doubt
 from tests.postflight.report.conftest import HOSTILE
 
@@ -31,6 +34,11 @@ LARGEST_BYTES = 3_000_000
 def payload(text: str) -> dict:
     """Numbers that the page's scripts draw."""
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+
+
+def plain(words: str) -> str:
+    """Words with spaces at which a line may end."""
+    return words.replace("\u00a0", " ")
 
 
 @pytest.fixture(scope="module")
@@ -147,10 +155,45 @@ def test_page_files_are_in_the_package() -> None:
 
 def test_title_is_the_answer(run, text: str) -> None:
     answer = run.summary["methods"]["fused"]
-    assert f" {texts.pair(answer['mean_deg'], answer['mean_sd_deg'])}° " in texts.title(run)
-    assert f" {answer['largest_deg']:.1f}° " in texts.title(run)
+    numbers = [pair(answer["deflection_deg"], answer["sd_deg"]), pair(answer["mean_deg"], answer["mean_sd_deg"])]
+    numbers.append(f"{answer['largest_deg']:.2f}")
+    assert plain(texts.title(run)) == "Deflection at peak q {}°, cycle mean {}°, largest {}°".format(*numbers)
     assert f"<h1>{texts.title(run)}</h1>" in text
-    assert texts.lead(run)[0].startswith(f"{texts.pair(answer['deflection_deg'], answer['sd_deg'])}° at ")
+
+
+def test_headline_card_and_terminal_say_one_answer(run, text: str) -> None:
+    """The same quantities by the same names: the card's are those of the headline, and so are the command's."""
+    fused = next(card for card in texts.cards(run) if card["method"] == "fused")
+    on_card = {fused["at"]: f"{fused['value']} ± {fused['sd']}"} | dict(fused["others"])
+    with console.capture() as shown:
+        print_answers(run.deflections)
+    (row,) = [line for line in shown.get().splitlines() if " fused " in line]
+    assert list(on_card) == ["at peak q", "cycle mean", "largest"]
+    for name, number in on_card.items():
+        assert f"{name} {number}°" in plain(texts.title(run))
+        assert number in row
+    assert all(f"{name} <b>{number}°</b>" in text for name, number in fused["others"])
+    assert f"{fused['value']}°<small>± {fused['sd']}</small>" in text
+
+
+def test_truth_stands_beside_the_estimates(run, reported: Path, text: str) -> None:
+    score = score_run(reported, run.path)
+    table = texts.against_truth(score)
+    assert all(f"<td>{cell}</td>" in text for row in table["rows"] for cell in row if cell)
+    for row, (method, scored) in zip(table["rows"], score.methods.items(), strict=False):
+        assert method in row[0]
+        places = decimals(scored["sd_deg"])
+        assert row[2] == f"{scored['deflection_deg']:.{places}f}"
+        assert float(row[3]) == pytest.approx(scored["truth_deg"], abs=0.006)
+        assert float(row[4]) == pytest.approx(scored["error_deg"], abs=0.6 * 10.0**-places)
+    shown = next(card["value"] for card in texts.cards(run) if card["method"] == "fused")
+    assert table["rows"][list(score.methods).index("fused")][2] == shown
+
+
+def test_without_truth_the_page_is_the_same_but_for_its_errors(run, text: str) -> None:
+    without = page(run)
+    assert 'id="truth"' not in without
+    assert re.sub(r'<div id="truth">.*?</table>\n</div>\s*</div>\n', "", text, flags=re.DOTALL) == without
 
 
 def test_a_fused_angle_beyond_its_inputs_says_why(run) -> None:
@@ -167,11 +210,11 @@ def test_a_fused_angle_beyond_its_inputs_says_why(run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "sd", "wanted"), [(4.88, 0.096, "4.9 ± 0.1"), (3.3, 0.49, "3.3 ± 0.5"), (12.0, 2.2, "12 ± 2"),
-                                (0.5, 0.02, "0.50 ± 0.02"), (1.0, 0.0, "1.00 ± 0.00")],
+    ("value", "sd", "wanted"), [(4.88, 0.096, "4.88 ± 0.10"), (3.3, 0.49, "3.3 ± 0.5"), (12.0, 2.2, "12.0 ± 2.2"),
+                                (0.5, 0.036, "0.50 ± 0.04"), (1198.3, 36.0, "1198 ± 36"), (1.0, 0.0, "1.00 ± 0.00")],
 )  # fmt: skip
 def test_pair_has_the_digits_that_its_sd_deserves(value: float, sd: float, wanted: str) -> None:
-    assert texts.pair(value, sd).replace("\u00a0", " ") == wanted
+    assert pair(value, sd) == wanted
 
 
 def test_cards_carry_the_result_of_the_tests_of_pairs(run) -> None:
@@ -180,7 +223,8 @@ def test_cards_carry_the_result_of_the_tests_of_pairs(run) -> None:
         method = card["method"]
         mine = pairs if method == "fused" else pairs[[method in m.split(" and ") for m in pairs["methods"]]]
         assert card["state"] == ("agrees" if mine["passed"].all() else "differs")
-        assert card["value"] == f"{run.summary['methods'][method]['deflection_deg']:.2f}"
+        answer = run.summary["methods"][method]
+        assert f"{card['value']} ± {card['sd']}" == pair(answer["deflection_deg"], answer["sd_deg"])
 
 
 def test_a_pair_that_disagrees_is_named(run) -> None:
@@ -230,7 +274,7 @@ def test_rocket_without_vehicle_says_why(rocket: Path) -> None:
     data = payload(text)
     title = texts.title(run).replace("\u00a0", " ")
     assert title.startswith("Prometheus")
-    assert "5.50 ± 0.01 km" in title
+    assert "5.500 ± 0.010 km" in title
     assert [p["id"] for p in data["panels"]] == ["altitude", "speed", "mach", "pressure"]
     assert data["solid"] is None
     absent = set(re.findall(r'data-absent="([^"]*)"', text))
@@ -419,16 +463,14 @@ def test_worst_frames_are_shown_with_their_numbers(run, text: str) -> None:
     assert [float(t) for t in shown] == pytest.approx(table["t_s"].iloc[pictures.worst_first(table)[:5]], abs=0.006)
 
 
-def test_what_is_not_stated_is_said_once() -> None:
-    lines = [
-        "position rests on A (uncertainty not stated)",
-        "height rests on B (uncertainty not stated)",
-        "rho on C to 2 %",
+def test_what_absolute_values_depend_on_is_a_table_and_no_lead(run, text: str) -> None:
+    rows = texts.rests_on(run.summary["rests_on"])
+    assert [value for value, _ in rows] == ["position", "height", "azimuth", "density's level"]
+    assert all(f"<td>{on}</td>" in text for _, on in rows)
+    assert not any(on in words for _, on in rows for words in texts.lead(run))
+    assert texts.rests_on(["position, height and azimuth rest on the state at 3 s"]) == [
+        ["position, height and azimuth", "state at 3 s"]
     ]
-    joined = texts._rests_on(lines)
-    assert joined == "rho on C to 2 %; position rests on A; height rests on B (uncertainties not stated)"
-    assert texts._rests_on(lines[:1]) == lines[0]
-    assert texts._rests_on([]) == ""
 
 
 @pytest.mark.parametrize(
