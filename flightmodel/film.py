@@ -52,7 +52,8 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 WEBM_START = b"\x1aE\xdf\xa3"
 PICTURE_KINDS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP")
-UNKNOWN_FILM = "cannot be opened as a film (known are .webm, .mp4 and .avi)"
+FILM_SUFFIXES = (".webm", ".mp4", ".avi")
+UNKNOWN_FILM = f"cannot be opened as a film (known are {', '.join(FILM_SUFFIXES)})"
 _SPREAD = 9  # frames over a film
 _FINEST, _REDUCED = 410.0, 310.0  # px a radian
 NO_PICTURE: Image = np.zeros((0, 0), dtype=np.uint8)

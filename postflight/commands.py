@@ -28,8 +28,8 @@ from flightmodel.vehicle import read_vehicle
 from postflight import run_folder, warmup
 from postflight.beside import Beside, Task, same
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, said, with_increments
-from postflight.flight import NO_VIDEO, Flight, read_flight
-from postflight.methods import Inputs
+from postflight.flight import Flight, read_flight
+from postflight.methods import NO_VIDEO, Inputs
 from postflight.plots.style import FigureFolder
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.text import rests_on

@@ -25,7 +25,6 @@ from recon.settings import Settings
 
 READ = "pf.read_flight(folder)"
 RECONSTRUCT = "pf.reconstruct(flight)"
-NO_VIDEO = "video-missing"  # code of the refusal
 PULSE_RATE_HZ = 50.0
 _ON_TOP = ("c_a", "c_n", "c_m", "cg_shift_body_m", "density", "wind")  # what acts on earlier changes
 SETTINGS = {f.name for f in fields(Settings)}

@@ -17,14 +17,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from estimators.loads import FlightLoads
 from flightmodel.checks import GateError, Issue
+from flightmodel.film import FILM_SUFFIXES
 from flightmodel.flightfolder import Sources
 from flightmodel.telemetry import Telemetry
-from postflight.flight import NO_VIDEO, Flight
 
-_FILMS = (".webm", ".mp4", ".avi")
+if TYPE_CHECKING:  # `postflight check` waits for no estimator and no filter
+    from estimators.loads import FlightLoads
+
+NO_VIDEO = "video-missing"  # code of the refusal
 BY_LOADS = ("misalignment", "trim", "fused")
 _NO_TRACKER = Issue(
     "there is no radar, receiver or entry state, which the trajectory needs: state [radars.NAME], [gnss.NAME] or "
@@ -56,12 +59,12 @@ class Inputs:
     @classmethod
     def of(cls, given: Telemetry | Sources | FlightLoads) -> Inputs:
         """Find what telemetry, the sources of a flight folder, or loads hold."""
-        if isinstance(given, FlightLoads):
-            return cls(vehicle=True, loads=True)
         if isinstance(given, Sources):
             inertial, state = {"accelerometer", "rates"} <= set(given.triads), given.state
-        else:
+        elif isinstance(given, Telemetry):
             inertial, state = given.accelerometer is not None and given.rates is not None, given.start.state
+        else:
+            return cls(vehicle=True, loads=True)
         tracker = bool(given.radars or given.gnss or state is not None)
         return cls(given.vehicle is not None, bool(given.films), inertial, tracker)
 
@@ -117,17 +120,18 @@ def runs_alone(folder: Path, vehicle: Path, named: set[str]) -> dict[str, Inputs
     from postflight.film_alone import read_film
     from postflight.loads_table import read_loads
 
+    def telemetry_of(film: Path, times: Path) -> Telemetry:
+        return read_film(film, times, vehicle).telemetry
+
     out: dict[str, Inputs] = {}
     tables = [path for place in (folder, folder / "telemetry") for path in sorted(place.glob("*.csv"))]
     for table in (path for path in tables if path.relative_to(folder).as_posix() not in named):
-        beside = sorted(path for path in table.parent.iterdir() if path.is_dir() or path.suffix in _FILMS)
-        attempts: dict[str, Callable[[], FlightLoads | Flight]] = {
+        beside = sorted(path for path in table.parent.iterdir() if path.is_dir() or path.suffix in FILM_SUFFIXES)
+        attempts: dict[str, Callable[[], FlightLoads | Telemetry]] = {
             f"--loads {table}": partial(read_loads, table, vehicle),
-            **{f"--film {film} --times {table}": partial(read_film, film, table, vehicle) for film in beside},
+            **{f"--film {film} --times {table}": partial(telemetry_of, film, table) for film in beside},
         }
         for words, read in attempts.items():
             with suppress(GateError):
-                found = read()
-                inputs = Inputs.of(found if isinstance(found, FlightLoads) else found.telemetry)
-                out[f"postflight deflection {words} --vehicle {vehicle}"] = inputs
+                out[f"postflight deflection {words} --vehicle {vehicle}"] = Inputs.of(read())
     return out

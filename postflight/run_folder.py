@@ -38,7 +38,7 @@ from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections, headline, no_answer_at, quantiles_at
-from postflight.flight import NO_VIDEO
+from postflight.methods import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.measurements import component_unit
 

@@ -34,7 +34,7 @@ from flightmodel.atmosphere import EARTH_RADIUS_US76_M, R_AIR_JPKGK
 from flightmodel.checks import ConfigError, FloatArray, GateError, Issue
 from flightmodel.config import read_toml
 from flightmodel.files import file_bytes, write_file, writing
-from flightmodel.film import start_fault
+from flightmodel.film import FILM_SUFFIXES, start_fault
 from flightmodel.instruments import TriadSpec
 from flightmodel.tables import to_si
 from flightmodel.telemetry import TriadRecord, find_rest, mean_readings
@@ -63,7 +63,6 @@ _TABLES = (  # what is named so and holds no table is refused
     ".csv", ".tsv", ".dat", ".asc", ".tab", ".mat", ".xlsx", ".xlsm", ".xls", ".parquet", ".nc", ".cdf", ".h5", ".hdf5",
 )  # fmt: skip
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-_FILMS = (".webm", ".mp4", ".avi")
 _RADIOSONDE = {"alt", "temperature", "pressure"}
 _BY_DIRECTION, _BY_COMPONENTS = {"wind_speed", "wind_from"}, {"wind_north", "wind_east"}
 EXIT_NOT_ALL_USED = 3
@@ -252,7 +251,7 @@ def _video_of(path: Path, telemetry: Path) -> Video | None:
     if path.is_dir():
         names = sorted(p.name for p in path.iterdir() if p.suffix.lower() in _PICTURES and p.is_file())
         return Video(path, place, tuple(names)) if names else None
-    return Video(path, place) if path.suffix.lower() in _FILMS and path.is_file() else None
+    return Video(path, place) if path.suffix.lower() in FILM_SUFFIXES and path.is_file() else None
 
 
 def _copy(video: Video) -> None:

@@ -17,7 +17,8 @@ from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections
 from postflight.filming import by_camera, keep_oriented
-from postflight.flight import NO_VIDEO, RECONSTRUCT, Flight
+from postflight.flight import RECONSTRUCT, Flight
+from postflight.methods import NO_VIDEO
 from postflight.plots.style import flight_words
 from postflight.reconstruction import Reconstruction
 from postflight.runs import Run
