@@ -32,6 +32,8 @@ CONVENTIONS.md has them all. Refusals are `GateError`, a `ValueError`, with a st
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -119,6 +121,22 @@ __all__ = [
     "simulate",
     "write_report",
 ]
+
+
+def _require_own_packages() -> None:
+    """Raise `ImportError` where a script or another distribution has a name of ours (docs/decisions/0012)."""
+    ours = Path(__file__).parents[1]
+    for name in ("flightmodel", "recon", "estimators", "synthetic_flight"):
+        found = find_spec(name)
+        place = Path(found.origin) if found and found.origin else ours / name
+        if ours / name not in place.parents:
+            raise ImportError(
+                f"{place} hides the package '{name}' of postflight ({ours / name}): rename it, start Python in another "
+                "folder, or install postflight in an environment of its own"
+            )
+
+
+_require_own_packages()
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,7 @@
 """The public interface: every name is there and documented, what-ifs are changed flights, results show themselves."""
 
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -467,3 +468,20 @@ def test_linear_algebra_of_the_public_functions_runs_on_one_thread():
 def test_no_module_takes_the_place_of_a_public_name(name):
     """A submodule becomes an attribute of its package as soon as anything imports it: `pf.score` was a module then."""
     assert find_spec(f"postflight.{name}") is None
+
+
+@pytest.mark.parametrize("other", ["recon.py", "estimators/__init__.py"])
+def test_another_file_of_one_of_our_names_is_named(tmp_path: Path, other: str) -> None:
+    """An analyst's ``recon.py`` beside a script would otherwise end in an error about a name that it does not have."""
+    (tmp_path / other).parent.mkdir(exist_ok=True)
+    (tmp_path / other).write_text("")
+    done = subprocess.run(
+        [sys.executable, "-c", "import postflight"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}"},
+    )
+    assert done.returncode == 1
+    assert f"{tmp_path / other} hides the package '{Path(other).parts[0].removesuffix('.py')}'" in done.stderr
+    assert "rename it" in done.stderr
