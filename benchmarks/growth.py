@@ -244,10 +244,10 @@ def imu(sizes, rate_hz):
 def reconstruct_one(folder):
     """In its own process: read a flight and find its trajectory once, whatever a check says; name those that fail."""
     from flightmodel.flightfolder import read_flight
-    from recon.reconstruct import reconstruct_once
+    from recon.estimate import estimate
     from recon.settings import Settings
 
-    solution = reconstruct_once(read_flight(Path(folder)), Settings())
+    solution = estimate(read_flight(Path(folder)), Settings())
     print(len(solution.imu_time_s), *(check.code for check in solution.consistency_checks if not check.passed))
 
 

@@ -59,8 +59,8 @@ from recon.entry_density import (
     profile_as_flown,
     temperature_check,
 )
+from recon.estimate import TrajectorySolution
 from recon.fault_isolation import isolate_faults
-from recon.reconstruct import TrajectorySolution
 from recon.reconstruct import reconstruct as solve
 from recon.settings import Settings
 from recon.survey import rests_on

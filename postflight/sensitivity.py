@@ -29,7 +29,7 @@ from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, interpolate_rows, resample
 from postflight.flight import Flight, calm, with_density, with_mass
 from postflight.reconstruction import Reconstruction, bet_table, reconstruction_from
-from recon.reconstruct import reconstruct_once, trackers
+from recon.estimate import estimate, trackers
 from recon.settings import Settings
 
 MASS_PART = 0.01
@@ -146,14 +146,14 @@ def sensitivity(flight: Reconstruction, progress: Progress | None = None) -> pd.
     # where a tracker was left out the base's covariance was enlarged, and is not that of an optimal filter
     own = flight
     if flight.solution.left_out:
-        own = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings, adaptation=adaptation))
+        own = reconstruction_from(Flight(telemetry), estimate(telemetry, settings, adaptation=adaptation))
     rows: list[dict[str, object]] = []
     for k, rerun in enumerate(planned):
         report(k / len(planned), rerun.name)
         try:
             bet = flight.solution
             if rerun.filtered:
-                bet = reconstruct_once(rerun.telemetry, rerun.settings, adaptation=adaptation)
+                bet = estimate(rerun.telemetry, rerun.settings, adaptation=adaptation)
             rows += _rows(rerun, flight, own, reconstruction_from(Flight(rerun.telemetry), bet))
         except GateError as fault:
             rows.append({"rerun": rerun.name, "reason": str(fault)})

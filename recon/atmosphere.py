@@ -51,7 +51,7 @@ from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
 from recon.consistency import data_sheet_check
-from recon.reconstruct import TrajectorySolution
+from recon.estimate import TrajectorySolution
 
 # a third of the winds' correlation length
 _KNOT_M, _TRAJECTORY_TIME_S = 1000.0, 20.0

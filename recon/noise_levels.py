@@ -38,8 +38,8 @@ from flightmodel import tables
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.instruments import ACCELEROMETER, RATES, BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, table_of
 from flightmodel.telemetry import Telemetry
-from recon import ekf, reconstruct, single_faults
-from recon.reconstruct import Linearised
+from recon import ekf, estimate, single_faults
+from recon.estimate import Linearised
 from recon.settings import Settings
 
 _PRIOR_SD = np.log(3.0)  # of a level's logarithm: data sheets and defaults were found to be up to ten times too large
@@ -164,7 +164,7 @@ def noise_levels(
     at = stated
     for number in range(_MOST_ROUNDS):
         report(number / _MOST_ROUNDS, f"noise levels, round {number + 1}")
-        about = reconstruct.linearised(_with(telemetry, places, at), settings)
+        about = estimate.linearised(_with(telemetry, places, at), settings)
         found = _Likelihood(telemetry, places, prior, settings, about)
         before, at = at, found.maximised(at)
         if np.abs(at - before).max() < _RELINEARISED:

@@ -1,168 +1,107 @@
-"""Where was the vehicle, how was it oriented, and how accurately is that known? The best-estimated trajectory.
+"""Which trajectory stands once the data's contradictions are resolved? Estimate, assess, adapt.
 
-Inertial sensors propagate the state, trackers (radars, receivers, barometers) correct it, a smoother carries later data
-back to every earlier time, and the whole is repeated about the smoothed trajectory until that no longer changes the
-result (`Settings.passes`):
+The first estimate (`recon.estimate`) takes every source as it is stated, and is assessed: its consistency checks, the
+sensors at rest, and, where a check fails, the likelihood of single faults. Each rule of `RULES` then looks at what has
+been found so far. It proposes one `Change` of what is assumed, or none; the changed case is estimated once more, and
+the rule judges which of the two stands:
 
-    x_{k+1} = f(x_k, inertial samples) + w,   z = h(x_k) + v;   x = kinematics and sensor errors
+| rule | proposes where | stands where |
+|---|---|---|
+| `inertial_clock` | the oscillation shows accelerometer and gyros at different times | always |
+| `tracker_clocks` | time tags of trackers explain the failed checks best | it fails no check, or both fail some |
+| `wider_priors` | an error is larger than its data sheet allows | always; checks still judge what was stated |
+| `contradicting_trackers` | a check about a tracker fails | all is consistent without some of its points |
+| `shared_errors` | all radar sites may err together | never: it adds a check |
 
-Aerodynamics and atmosphere take no part: the answer is inertial, and aerodynamic quantities can be derived from it. A
-flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.propagation`).
-
-What the data contradict is found on the way and the flight reconstructed again: jumps of the inertial clocks, transient
-offsets of readings, a priori uncertainties that are too small, trackers that contradict the rest
-(`recon.fault_detection`, `recon.fault_isolation`). First passes use thinned data about the filter's own estimate, later
-ones all data about the smoothed trajectory (Gauss-Newton); of ballistic flight with a measured deceleration one pass
-about the filter's own estimate is all (`recon.linearisation`).
-
-The answer is of the datum, and of the accelerometer's samples. From the accelerometer (at ``r`` from the datum, body
-axes) to the datum:
-
-    p = p_imu - C r,   v = v_imu - C (w x r),   w = gyro rate - C^T W
-
-and the errors move with them: ``dp = dp_imu + C [r x] d``, ``dv = dv_imu + C [(w x r) x] d + C [r x] dw`` with
-rotation error ``d`` and rate error ``dw`` from the gyros' estimated errors, their clock's too, and white noise. In
-ballistic flight the tracked point is the datum and the attitude unknown, with the covariance of an unknown attitude.
-
-References
-----------
-P. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd ed., chapters 3 and 14.
-B. Bell, "The iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optim. 4 (1994) 626.
+So a flight is estimated at most once more for each rule, and each change that stands is a finding, with what it did to
+the trajectory. Where no points of one tracker explain the contradiction, the covariance grows by the difference.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from flightmodel import rotations
-from flightmodel.checks import Check, FloatArray, GateError, Issue, Progress
-from flightmodel.earth import WGS84, name_of
+from flightmodel.checks import Check, GateError, Issue, Progress
 from flightmodel.telemetry import Telemetry
-from flightmodel.trajectory import Trajectory, interpolate_rows
-from recon import (
-    consistency,
-    ekf,
-    fault_isolation,
-    imu_screening,
-    linearisation,
-    oscillation,
-    rest,
-    setup,
-    single_faults,
-    smoother,
-    survey,
-    time_bias,
-    tracker_time,
-)
-from recon.consistency import held_out_table
-from recon.deceleration import deceleration_checks
-from recon.ekf import Problem, with_servo_lag
-from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
-from recon.fault_detection import (
-    UNMODELLED_CODE,
-    UnmodelledAcceleration,
-    carried_check,
-    unsupported_offsets,
-    with_unmodelled,
-)
-from recon.fault_isolation import INFLATION, NO_ADAPTATION, Adaptation, LeftOut
-from recon.imu_screening import BridgedSensor
-from recon.linearisation import SpinPhase
-from recon.measurements import DECELERATION
-from recon.propagation import correct, correction_partials
+from flightmodel.trajectory import Trajectory, difference, resample
+from recon import ekf, fault_isolation, linearisation, rest, setup, single_faults, survey, tracker_time
+from recon.ekf import Problem
+from recon.estimate import TrajectorySolution, bridge_inertial_sensors, estimate, trackers
+from recon.fault_detection import UNMODELLED_CODE
+from recon.fault_isolation import INFLATION, Adaptation
 from recon.settings import Settings
-from recon.setup import InertialSensors, build_problem
 from recon.single_faults import Single, SingleFault
-from recon.smoother import Smoothed
-from recon.state import KINEMATIC, States, unpacked
+from recon.state import States
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
 _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radian
-_BLOCK = 1 << 16  # samples that are corrected at a time
-_NODES = 512  # whose covariances are unpacked at a time
 
 
 @dataclass(frozen=True)
-class TrajectorySolution:
-    """Best-estimated trajectory with sensor errors, residuals, consistency checks and findings.
+class Case:
+    """What an estimate is made of."""
+
+    telemetry: Telemetry
+    settings: Settings
+    adaptation: Adaptation
+
+    def solved(self, report: Progress | None = None) -> TrajectorySolution:
+        """Estimate the case."""
+        return estimate(self.telemetry, self.settings, report, self.adaptation)
+
+    def adapted(self, solution: TrajectorySolution, **changes: object) -> Case:
+        """Return the case with what its solution found, and changes of that."""
+        return replace(self, adaptation=replace(solution.adaptation, **changes))  # type: ignore[arg-type]
+
+    def coarse(self) -> Settings:
+        """Settings of estimates that are only compared."""
+        rate_hz = min(self.settings.output_rate_hz, _LEAVE_ONE_OUT_RATE_HZ)
+        return replace(self.settings, output_rate_hz=rate_hz, pulse_rate_hz=0.0)
+
+
+@dataclass(frozen=True)
+class Assessed:
+    """A case with its solution, what was known before any estimate, and single faults that explain what failed."""
+
+    case: Case
+    solution: TrajectorySolution
+    at_rest: Adaptation
+    faults: tuple[SingleFault, ...]
+
+
+@dataclass(frozen=True)
+class Change:
+    """One change of what is assumed.
 
     Parameters
     ----------
-    smoothed, filtered : Trajectory
-        Of the datum, with covariance; ``filtered`` uses data up to each time (in the last pass).
-    sensor_errors : DataFrame
-        ``name, unit, treated, prior_sd, estimate, sd``; of Gauss-Markov errors, the value at mid-span.
-    residuals : DataFrame
-        ``time_s, source, component, residual, predicted_sd, accepted, used``: innovations of the last pass, SI; what is
-        not used was held out and only checks.
-    held_out : DataFrame
-        ``time_s, source, component, residual, predicted_sd``: measurements that were not used, against the smoothed
-        trajectory (`recon.consistency`).
-    consistency_checks : tuple of Check
-    imu_time_s : (k,) float
-        Times of the accelerometer's valid samples outside gyro gaps.
-    specific_force_body_mps2, rate_body_radps : (k, 3) float
-        At the accelerometer, corrected for estimated bias, scale and mount; not smoothed.
-    specific_force_cov, rate_cov : (n, 3, 3) float
-        Systematic error covariance of the corrected specific force, (m/s^2)^2, and rates, (rad/s)^2, on the
-        trajectory's times; empty without inertial sensors.
-    accelerometer_root : (n, 6, 9) float
-        Rotation and specific force error per unit normal of the accelerometer's errors, `accelerometer_root`.
-    triad_root : (n, 9, 18) float
-        Rotation, specific force and rate error per unit normal of both triads' errors, `triad_root`.
-    findings : tuple of Issue
-        Gaps that were bridged, stretches of radar track that were edited, and so on.
-    provenance : dict
-    left_out : tuple of LeftOut
-        Leave-one-out comparison of the trackers, where a check about one failed.
-    adaptation : Adaptation
-        What was found in the data, for other reconstructions that are to be compared with this one.
-    single_faults : tuple of SingleFault
-        Single hypotheses that explain what failed, the likeliest first.
-    drag : DragHistory or None
-        What the deceleration says of the air; None without accelerometer and drag.
+    words : str
+        What was changed.
+    case : Case or None
+        What is estimated instead; None where nothing is.
+    judged : callable
+        Takes the new solution, and returns what stands; None where that is ``otherwise``.
+    otherwise : TrajectorySolution
     """
 
-    smoothed: Trajectory
-    filtered: Trajectory
-    sensor_errors: pd.DataFrame
-    residuals: pd.DataFrame
-    held_out: pd.DataFrame
-    consistency_checks: tuple[Check, ...]
-    imu_time_s: FloatArray
-    specific_force_body_mps2: FloatArray
-    rate_body_radps: FloatArray
-    specific_force_cov: FloatArray
-    rate_cov: FloatArray
-    accelerometer_root: FloatArray
-    triad_root: FloatArray
-    findings: tuple[Issue, ...]
-    provenance: dict[str, object]
-    left_out: tuple[LeftOut, ...] = ()
-    adaptation: Adaptation = NO_ADAPTATION
-    single_faults: tuple[SingleFault, ...] = ()
-    drag: DragHistory | None = None
+    words: str
+    case: Case | None
+    judged: Callable[[TrajectorySolution], TrajectorySolution | None]
+    otherwise: TrajectorySolution
 
-    @property
-    def settings(self) -> Settings:
-        """Settings that it was made with."""
-        chosen = self.provenance["settings"]
-        assert isinstance(chosen, dict)
-        return Settings(**chosen)
 
-    @property
-    def output_rate_hz(self) -> float:
-        """Rate of the trajectories outside the pulse."""
-        return self.settings.output_rate_hz
+Rule = Callable[[Assessed, Progress], Change | None]
 
 
 def reconstruct(
     telemetry: Telemetry, settings: Settings | None = None, progress: Progress | None = None
 ) -> TrajectorySolution:
-    """Reconstruct a flight; where a check about a tracker fails, compare solutions without each tracker.
+    """Estimate a flight, and once more for each change that its contradictions ask for.
 
     Parameters
     ----------
@@ -181,23 +120,12 @@ def reconstruct(
     report = progress or (lambda _fraction, _what: None)
     at_rest = _checks_at_rest(telemetry, settings)
     known = Adaptation(inflated_sd=rest.inflated_priors(telemetry, at_rest, INFLATION))
-    solution = reconstruct_once(telemetry, settings, lambda f, what: report(0.5 * f, what), known)
-    faults: tuple[SingleFault, ...] = ()
-    of_readings = fault_isolation.ABOUT_DECELERATION
-    if any(not check.passed and check.code not in of_readings for check in solution.consistency_checks):
-        report(0.5, "trying single faults")
-        faults = _single_faults(telemetry, settings, solution)
-        telemetry, solution = _with_corrected_clock(telemetry, settings, solution, faults)
-    if late_s := tracker_time.lags(telemetry, faults, solution.sensor_errors):
-        solution = _with_tags_set_back(telemetry, settings, replace(known, late_s=late_s), solution)
-    inflated = known.inflated_sd | fault_isolation.inflated_priors(solution.consistency_checks, solution.sensor_errors)
-    inflated |= fault_isolation.inflated_clocks(solution.adaptation.lag, telemetry)
-    if inflated != known.inflated_sd:
-        solution = _with_inflated_priors(telemetry, settings, solution, inflated)
-    sources = trackers(telemetry, settings)
-    if len(sources) > 1 and fault_isolation.any_tracker_fails(solution.consistency_checks, sources):
-        solution = _compared_leaving_one_out(telemetry, settings, solution, sources, report)
-        solution = _with_shared_errors_tried(telemetry, settings, solution)
+    case = Case(telemetry, settings, known)
+    solution = case.solved(lambda f, what: report(0.5 * f, what))
+    now = Assessed(case, solution, known, _single_faults(case, solution, report))
+    for rule in RULES:
+        now = _adapted(now, rule(now, report), report)
+    telemetry, solution = now.case.telemetry, now.solution
     times, lags, table = tracker_time.judged_by_the_stated(
         telemetry, solution.adaptation.late_s, solution.sensor_errors, settings.check_confidence
     )
@@ -207,12 +135,177 @@ def reconstruct(
         sensor_errors=table,
         consistency_checks=(*solution.consistency_checks, *at_rest, *times),
         findings=(*solution.findings, *lags, *rest.noise_findings(telemetry), *survey.unchecked_state(telemetry)),
-        single_faults=faults,
+        single_faults=now.faults,
     )
 
 
-def _single_faults(telemetry: Telemetry, settings: Settings, solution: TrajectorySolution) -> tuple[SingleFault, ...]:
-    """Single hypotheses, likeliest first: of the two triads alone, where their oscillation contradicts itself."""
+def _adapted(now: Assessed, change: Change | None, report: Progress) -> Assessed:
+    """What stands after a change that a rule proposes."""
+    if change is None:
+        return now
+    stands = None
+    if change.case is not None:
+        report(0.5, change.words)
+        with suppress(GateError):  # a case without a trajectory explains nothing
+            again = change.case.solved()
+            stands = change.judged(again)
+    if change.case is None or stands is None:
+        return replace(now, solution=change.otherwise)
+    if stands.smoothed is not again.smoothed:
+        return replace(now, solution=stands)
+    moved = Issue(f"{change.words}: {_moved(now.solution.smoothed, again.smoothed)}", "estimated-again")
+    return replace(now, case=change.case, solution=replace(stands, findings=(*stands.findings, moved)))
+
+
+def _moved(before: Trajectory, after: Trajectory) -> str:
+    """How far a trajectory has moved, in words."""
+    t = after.time_s[(after.time_s >= before.time_s[0]) & (after.time_s <= before.time_s[-1])]
+    error = difference(resample(after, t), resample(before, t))
+    metres, rad = (float(np.linalg.norm(error[:, k : k + 3], axis=1).max()) for k in (0, 6))
+    return f"the trajectory moved by up to {metres:.3g} m and {np.rad2deg(rad):.2g} deg"
+
+
+# ---- rules
+
+
+def inertial_clock(now: Assessed, _report: Progress) -> Change | None:
+    """Correct the tags of the likelier triad, where a lag is too long to be linear."""
+    telemetry, first, faults = now.case.telemetry, now.solution, now.faults
+    lag, swings = first.adaptation.lag, first.adaptation.oscillation
+    if lag is None or not faults or abs(lag.lag_s) < _LINEAR_LAG_S:
+        return None
+    name = faults[0].sources[0]
+    one = next(c for c in single_faults.corrections(telemetry, swings, lag) if c.sources == (name,))
+    # which of the two it is may be open: then both may still be off by all of it
+    sure = len(single_faults.likeliest(faults)) == 1
+    wide_s = INFLATION * (lag.sd_s if sure else abs(lag.lag_s))
+    known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
+    words = f"{one.words.partition(': ')[2]}: corrected"
+
+    def judged(again: TrajectorySolution) -> TrajectorySolution:
+        start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
+        finding = Issue(words, "clock-corrected", name, start_s, end_s)
+        failed = [replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag"]
+        checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
+        return replace(again, consistency_checks=checks, findings=(*again.findings, finding))
+
+    return Change(f"{name}: {words}", replace(now.case, telemetry=one.telemetry, adaptation=known), judged, first)
+
+
+def tracker_clocks(now: Assessed, _report: Progress) -> Change | None:
+    """Set tags of trackers back."""
+    first = now.solution
+    late_s = tracker_time.lags(now.case.telemetry, now.faults, first.sensor_errors)
+    if not late_s:
+        return None
+
+    def judged(again: TrajectorySolution) -> TrajectorySolution | None:
+        return again if any(all(v.passed for v in one.consistency_checks) for one in (again, first)) else None
+
+    case = replace(now.case, adaptation=replace(now.at_rest, late_s=late_s))
+    return Change(f"{' and '.join(late_s)}: time tags set right", case, judged, first)
+
+
+def wider_priors(now: Assessed, _report: Progress) -> Change | None:
+    """Inflate priors that are too small; checks, which judge what was stated, stay those of the first."""
+    first, known = now.solution, now.at_rest.inflated_sd
+    inflated = known | fault_isolation.inflated_priors(first.consistency_checks, first.sensor_errors)
+    inflated |= fault_isolation.inflated_clocks(first.adaptation.lag, now.case.telemetry)
+    if inflated == known:
+        return None
+
+    def judged(again: TrajectorySolution) -> TrajectorySolution:
+        span = again.smoothed.time_s[[0, -1]].tolist()
+        found = fault_isolation.prior_inflation_findings(again.sensor_errors, inflated, *span)
+        checks, residuals = first.consistency_checks, first.residuals
+        return replace(again, consistency_checks=checks, residuals=residuals, findings=(*again.findings, *found))
+
+    return Change("priors wider than stated", now.case.adapted(first, inflated_sd=inflated), judged, first)
+
+
+def contradicting_trackers(now: Assessed, report: Progress) -> Change | None:
+    """Reject points of the one tracker that contradicts the rest, or let the covariance include how far they differ."""
+    case, solution = now.case, now.solution
+    sources = trackers(case.telemetry, case.settings)
+    if len(sources) < 2 or not fault_isolation.any_tracker_fails(solution.consistency_checks, sources):
+        return None
+    held_out: dict[str, pd.DataFrame] = {}
+
+    def unmodelled(made: TrajectorySolution) -> int:
+        return sum(f.code == UNMODELLED_CODE for f in made.findings)
+
+    def rerun(source: str) -> tuple[Trajectory, tuple[Check, ...], bool]:
+        report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
+        without = replace(case.coarse(), without=(*case.settings.without, source))
+        other = replace(case, settings=without, adaptation=solution.adaptation).solved()
+        held_out[source] = other.held_out
+        return other.smoothed, other.consistency_checks, unmodelled(other) > unmodelled(solution)
+
+    left_out, added = fault_isolation.leave_one_out(solution.smoothed, sources, rerun)
+    rejected = fault_isolation.rejected_points(left_out, held_out, solution.residuals, case.settings.gate_probability)
+
+    def judged(again: TrajectorySolution) -> TrajectorySolution | None:
+        if any(not v.passed for v in again.consistency_checks) or unmodelled(again) > unmodelled(solution):
+            return None
+        checks = fault_isolation.edit_checks_with_rejected(again.consistency_checks, again.residuals, rejected)
+        return replace(
+            again,
+            consistency_checks=checks,
+            findings=(*again.findings, *fault_isolation.rejected_point_findings(rejected)),
+            left_out=tuple(replace(s, inconsistent=False) for s in left_out),
+        )
+
+    enlarged = replace(
+        solution,
+        smoothed=fault_isolation.with_added_covariance(solution.smoothed, added),
+        filtered=fault_isolation.with_added_covariance(solution.filtered, added),
+        findings=(*solution.findings, *fault_isolation.leave_one_out_findings(left_out)),
+        left_out=left_out,
+    )
+    without = case.adapted(solution, rejected_points=rejected) if rejected else None
+    return Change(f"points of {' and '.join(rejected)} rejected", without, judged, enlarged)
+
+
+def shared_errors(now: Assessed, _report: Progress) -> Change | None:
+    """Add a failed check where an error of all radar sites together would make all data consistent."""
+    case, solution = now.case, now.solution
+    sources = trackers(case.telemetry, case.settings)
+    names = [name for name in survey.WIDE_SD if name in set(solution.sensor_errors.name)]
+    fails = len(sources) > 1 and fault_isolation.any_tracker_fails(solution.consistency_checks, sources)
+    if not (fails and names and case.telemetry.has_other_positions):
+        return None
+
+    def judged(again: TrajectorySolution) -> TrajectorySolution:
+        consistent = all(v.passed for v in again.consistency_checks if v.source != survey.SITES)
+        found = again.sensor_errors.set_index("name").loc[names, ["estimate", "sd"]].to_numpy(dtype=float)
+        check = survey.shared_error_check(found, names, consistent)
+        return (
+            solution if check is None else replace(solution, consistency_checks=(*solution.consistency_checks, check))
+        )
+
+    wide = replace(case.adapted(solution, inflated_sd=survey.WIDE_SD), settings=case.coarse())
+    return Change("sites wider than stated", wide, judged, solution)
+
+
+RULES: tuple[Rule, ...] = (inertial_clock, tracker_clocks, wider_priors, contradicting_trackers, shared_errors)
+
+
+# ---- assessment
+
+
+def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[Check]:
+    """Checks of the inertial sensors on the pad; none without a rest, or a place."""
+    points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
+    return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
+
+
+def _single_faults(case: Case, solution: TrajectorySolution, report: Progress) -> tuple[SingleFault, ...]:
+    """Single hypotheses where a check fails, likeliest first; of both triads where their oscillation shows it."""
+    of_readings = fault_isolation.ABOUT_DECELERATION
+    if all(check.passed or check.code in of_readings for check in solution.consistency_checks):
+        return ()
+    report(0.5, "trying single faults")
+    telemetry, settings = case.telemetry, case.settings
     known, swings = solution.adaptation, solution.adaptation.oscillation
     candidates = by_oscillation = single_faults.corrections(telemetry, swings, known.lag)
     if not by_oscillation:
@@ -250,549 +343,4 @@ def _single_faults(telemetry: Telemetry, settings: Settings, solution: Trajector
 
 def _coarse_problem(telemetry: Telemetry, coarse: Settings, known: Adaptation) -> Problem:
     sensors = bridge_inertial_sensors(telemetry, replace(known, rejected_offsets=()))
-    return build_problem(telemetry, coarse, sensors, known.rejected_points)
-
-
-def _with_corrected_clock(
-    telemetry: Telemetry, settings: Settings, first: TrajectorySolution, faults: tuple[SingleFault, ...]
-) -> tuple[Telemetry, TrajectorySolution]:
-    """Telemetry and solution with corrected tags of the likelier triad, where a lag is too long to be linear."""
-    lag, swings = first.adaptation.lag, first.adaptation.oscillation
-    if lag is None or not faults or abs(lag.lag_s) < _LINEAR_LAG_S:
-        return telemetry, first
-    name = faults[0].sources[0]
-    one = next(c for c in single_faults.corrections(telemetry, swings, lag) if c.sources == (name,))
-    # which of the two it is may be open: then both may still be off by all of it
-    sure = len(single_faults.likeliest(faults)) == 1
-    wide_s = INFLATION * (lag.sd_s if sure else abs(lag.lag_s))
-    known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
-    again = reconstruct_once(one.telemetry, settings, adaptation=known)
-    start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
-    finding = Issue(f"{one.words.partition(': ')[2]}: corrected", "clock-corrected", name, start_s, end_s)
-    failed = tuple(replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag")
-    checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
-    return one.telemetry, replace(again, consistency_checks=checks, findings=(*again.findings, finding))
-
-
-def _with_tags_set_back(
-    telemetry: Telemetry, settings: Settings, known: Adaptation, first: TrajectorySolution
-) -> TrajectorySolution:
-    """Solution with tags of trackers set back; the first where that one fails a check and the first fails some too."""
-    try:
-        again = reconstruct_once(telemetry, settings, adaptation=known)
-    except GateError:
-        return first
-    return again if any(all(v.passed for v in one.consistency_checks) for one in (again, first)) else first
-
-
-def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[Check]:
-    """Checks of the inertial sensors on the pad; none without a rest, or a place."""
-    points = setup.track_points(setup.tracking_instruments(telemetry, settings, np.zeros(3)))[1]
-    return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
-
-
-def _with_inflated_priors(
-    telemetry: Telemetry, settings: Settings, first: TrajectorySolution, inflated_sd: dict[str, float]
-) -> TrajectorySolution:
-    """Solution with inflated priors; its checks, which judge what was stated, stay those of the first."""
-    again = reconstruct_once(telemetry, settings, adaptation=replace(first.adaptation, inflated_sd=inflated_sd))
-    span = again.smoothed.time_s[[0, -1]].tolist()
-    findings = (
-        *again.findings,
-        *fault_isolation.prior_inflation_findings(again.sensor_errors, inflated_sd, *span),
-    )
-    return replace(again, consistency_checks=first.consistency_checks, residuals=first.residuals, findings=findings)
-
-
-def trackers(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
-    """Radars, receivers and barometers that are used."""
-    names = (*telemetry.radars, *telemetry.gnss, *telemetry.barometers)
-    return tuple(name for name in names if name not in settings.without)
-
-
-def _compared_leaving_one_out(
-    telemetry: Telemetry, settings: Settings, solution: TrajectorySolution, sources: tuple[str, ...], report: Progress
-) -> TrajectorySolution:
-    """Solution whose covariance and findings include how far the trackers contradict each other."""
-    coarse = min(settings.output_rate_hz, _LEAVE_ONE_OUT_RATE_HZ)
-    held_out: dict[str, pd.DataFrame] = {}
-
-    def unmodelled(made: TrajectorySolution) -> int:
-        return sum(f.code == UNMODELLED_CODE for f in made.findings)
-
-    def rerun(source: str) -> tuple[Trajectory, tuple[Check, ...], bool]:
-        report(0.5 + 0.5 * sources.index(source) / len(sources), f"without {source}")
-        without = replace(settings, without=(*settings.without, source), output_rate_hz=coarse, pulse_rate_hz=0.0)
-        other = reconstruct_once(telemetry, without, adaptation=solution.adaptation)
-        held_out[source] = other.held_out
-        return other.smoothed, other.consistency_checks, unmodelled(other) > unmodelled(solution)
-
-    left_out, added = fault_isolation.leave_one_out(solution.smoothed, sources, rerun)
-    rejected = fault_isolation.rejected_points(left_out, held_out, solution.residuals, settings.gate_probability)
-    if rejected:
-        again = reconstruct_once(telemetry, settings, adaptation=replace(solution.adaptation, rejected_points=rejected))
-        if all(v.passed for v in again.consistency_checks) and unmodelled(again) <= unmodelled(solution):
-            checks = fault_isolation.edit_checks_with_rejected(again.consistency_checks, again.residuals, rejected)
-            return replace(
-                again,
-                consistency_checks=checks,
-                findings=(*again.findings, *fault_isolation.rejected_point_findings(rejected)),
-                left_out=tuple(replace(s, inconsistent=False) for s in left_out),
-            )
-    return replace(
-        solution,
-        smoothed=fault_isolation.with_added_covariance(solution.smoothed, added),
-        filtered=fault_isolation.with_added_covariance(solution.filtered, added),
-        findings=(*solution.findings, *fault_isolation.leave_one_out_findings(left_out)),
-        left_out=left_out,
-    )
-
-
-def _with_shared_errors_tried(
-    telemetry: Telemetry, settings: Settings, solution: TrajectorySolution
-) -> TrajectorySolution:
-    """Solution with a failed check where an error of all radar sites together would make all data consistent."""
-    names = [name for name in survey.WIDE_SD if name in set(solution.sensor_errors.name)]
-    if not names or not telemetry.has_other_positions:
-        return solution
-    coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, _LEAVE_ONE_OUT_RATE_HZ), pulse_rate_hz=0.0)
-    again = reconstruct_once(telemetry, coarse, adaptation=replace(solution.adaptation, inflated_sd=survey.WIDE_SD))
-    consistent = all(v.passed for v in again.consistency_checks if v.source != survey.SITES)
-    found = again.sensor_errors.set_index("name").loc[names, ["estimate", "sd"]].to_numpy(dtype=float)
-    check = survey.shared_error_check(found, names, consistent)
-    if check is None:
-        return solution
-    return replace(solution, consistency_checks=(*solution.consistency_checks, check))
-
-
-def reconstruct_once(
-    telemetry: Telemetry,
-    settings: Settings,
-    progress: Progress | None = None,
-    adaptation: Adaptation = NO_ADAPTATION,
-) -> TrajectorySolution:
-    """Reconstruct a flight with the covariance as the filter has it, whatever its consistency checks find.
-
-    ``adaptation`` is what an earlier reconstruction found in the same data; clock jumps and transient offsets are
-    looked for where it does not state them.
-    """
-    report = progress or (lambda _fraction, _what: None)
-    report(0.0, "bridging gaps")
-    sensors = bridge_inertial_sensors(telemetry, adaptation)
-    problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    problem, run, smoothed, reference, passes, spans, phase = _iterate(problem, settings, report)
-    screened = _screened(telemetry, problem, run, sensors, adaptation)
-    known = adaptation.jumps or (), adaptation.rejected_offsets or ()
-    if (screened.jumps, screened.rejected_offsets) != known:
-        return reconstruct_once(telemetry, settings, progress, screened)
-    adaptation = screened
-
-    report(0.95, "testing consistency")
-    mount = _mounting(telemetry, sensors)
-    table = sensor_error_table(problem, reference, smoothed)
-    checks = consistency.source_checks(problem, run.innovations, settings.check_confidence)
-    checks += consistency.filter_against_smoother(problem, run, smoothed, reference, settings.check_confidence)
-    checks += deceleration_checks(telemetry, problem, run, settings.check_confidence)
-    checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
-    checks += [] if phase is None else [phase.check()]
-    checks += [] if sensors is None else [carried_check(spans)]
-    checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
-    held_out = held_out_table(problem, run)
-    checks += consistency.held_out_checks(problem, held_out, settings)
-    missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places)
-    tracked = bool(trackers(telemetry, settings))
-    checks += survey.place_checks(missed, settings.check_confidence, tracked)
-    filtered = datum_trajectory(problem, mount, run.states(), run.filtered.p_plus)
-    residuals = consistency.residual_table(problem, run.innovations)
-    edits = consistency.point_findings(problem, run.innovations.accepted, held_out, settings)
-    about = run.charts
-    del run  # as large as all that follows together
-    if sensors is not None and adaptation.lag is None:
-        more, adaptation = _oscillation_checks(telemetry, settings, sensors, problem, reference, adaptation)
-        checks += more
-    series = _series(problem, sensors, reference, smoothed)
-    findings = _sensor_findings(telemetry, sensors, adaptation)
-    report(1.0, "done")
-    path = datum_trajectory(problem, mount, reference, smoothed.triangles)
-    return TrajectorySolution(
-        smoothed=path,
-        filtered=filtered,
-        sensor_errors=table,
-        residuals=residuals,
-        held_out=held_out,
-        consistency_checks=tuple(checks),
-        imu_time_s=series[0],
-        specific_force_body_mps2=series[1],
-        rate_body_radps=series[2],
-        specific_force_cov=series[3],
-        rate_cov=series[4],
-        accelerometer_root=series[5],
-        triad_root=series[6],
-        findings=(*findings, *(span.finding() for span in spans), *edits),
-        provenance=_provenance(telemetry, settings, problem, passes),
-        adaptation=adaptation,
-        drag=drag_of_drivers(problem, reference, smoothed.triangles, path, about)
-        if sensors is None
-        else drag_of_readings(telemetry, path, series[0], series[1], series[3]),
-    )
-
-
-def _provenance(telemetry: Telemetry, settings: Settings, problem: Problem, passes: int) -> dict[str, object]:
-    """From what a trajectory was made, and how."""
-    return {
-        "flight": telemetry.name,
-        "settings": asdict(settings),
-        "start_s": float(problem.time_s[0]),
-        "end_s": float(problem.time_s[-1]),
-        "nodes": len(problem.time_s),
-        "states": problem.size,
-        "passes": passes,
-        "motion": "ballistic" if problem.motion.ballistic else "strapdown",
-        "hashes": dict(telemetry.hashes),
-        **_assumptions(telemetry),
-    }
-
-
-def _adapted_problem(
-    telemetry: Telemetry, settings: Settings, sensors: InertialSensors | None, adaptation: Adaptation
-) -> Problem:
-    telemetry = tracker_time.with_earlier_tags(telemetry, adaptation.late_s)
-    problem = build_problem(telemetry, settings, sensors, adaptation.rejected_points)
-    problem = fault_isolation.with_inflated_priors(problem, adaptation.inflated_sd)
-    if sensors is None:
-        return problem
-    return time_bias.with_lag(problem, adaptation.lag, sensors.force.spec.name, sensors.rate.spec.name)
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """A flight's reconstructed states at all nodes, about which others of the same data and other noise are linearised.
-
-    Parameters
-    ----------
-    states : States
-    adaptation : Adaptation
-    unmodelled : tuple of UnmodelledAcceleration
-    sensors : InertialSensors or None
-    """
-
-    states: States
-    adaptation: Adaptation
-    unmodelled: tuple[UnmodelledAcceleration, ...]
-    sensors: InertialSensors | None
-
-    def problem_of(self, telemetry: Telemetry, settings: Settings) -> Problem:
-        """Problem of the same flight with other standard deviations; its data are screened as before."""
-        sensors = self.sensors
-        if sensors is not None and telemetry.accelerometer is not None and telemetry.rates is not None:
-            force = imu_screening.with_noise(sensors.force, telemetry.accelerometer.spec.noise_sd)
-            sensors = InertialSensors(force, imu_screening.with_noise(sensors.rate, telemetry.rates.spec.noise_sd))
-        problem = _adapted_problem(telemetry, settings, sensors, self.adaptation)
-        return with_unmodelled(with_servo_lag(problem, self.states), self.unmodelled)
-
-
-def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
-    """Reconstruct a flight as `reconstruct_once` does, for its states at all nodes."""
-    adaptation = reconstruct_once(telemetry, settings).adaptation
-    sensors = bridge_inertial_sensors(telemetry, adaptation)
-    problem = _adapted_problem(telemetry, settings, sensors, adaptation)
-    *_, states, _, unmodelled, _ = _iterate(problem, settings, lambda _fraction, _what: None)
-    return Linearised(states, adaptation, unmodelled, sensors)
-
-
-def _assumptions(telemetry: Telemetry) -> dict[str, object]:
-    """What stands for a sensor that the flight did not have, and the planet where it is not the Earth."""
-    out: dict[str, object] = {} if telemetry.planet == WGS84 else {"planet": name_of(telemetry.planet)}
-    trim_deg = float(np.rad2deg(telemetry.motion.trim_sd_rad))
-    if trim_deg > 0.0:
-        out["attitude"] = (
-            f"assumed: trimmed, body x along the velocity against the air within {trim_deg:.2g} deg (1 sd)"
-        )
-    return out
-
-
-def _oscillation_checks(
-    telemetry: Telemetry,
-    settings: Settings,
-    sensors: InertialSensors,
-    problem: Problem,
-    states: States,
-    known: Adaptation,
-) -> tuple[list[Check], Adaptation]:
-    """Checks of both triads against each other by the oscillation, and the adaptation with what it shows."""
-    force, rate, checks = sensors.force, sensors.rate, []
-    span = float(problem.time_s[0]), float(problem.time_s[-1])
-    speed = problem.time_s, np.linalg.norm(states.velocity_ecef_mps, axis=-1)
-    swings = oscillation.oscillation(force, rate, *span, telemetry.vehicle, speed)
-    if swings is not None:
-        checks.append(oscillation.axes_check(swings, force, rate))
-        known = replace(known, oscillation=swings)
-    about_s = 0.0 if swings is None else swings.lag_s
-    lag = time_bias.lag_between(force, rate, states, problem.time_s, about_s=about_s)
-    if lag is not None and (swings is None or swings.kind in (oscillation.DELIVERED, oscillation.LAG)):
-        checks.append(time_bias.lag_check(lag, force, rate, settings.check_confidence))
-        known = replace(known, lag=None if checks[-1].passed else lag)
-    return checks, known
-
-
-def _screened(
-    telemetry: Telemetry,
-    problem: Problem,
-    run: ekf.ForwardPass,
-    sensors: InertialSensors | None,
-    adaptation: Adaptation,
-) -> Adaptation:
-    """Adaptation with clock jumps and, once these are corrected, transient offsets that are rejected."""
-    if sensors is None or telemetry.accelerometer is None or telemetry.rates is None:
-        return replace(adaptation, jumps=(), rejected_offsets=())
-    both = sensors.force, sensors.rate
-    if adaptation.jumps is None:
-        jumps = time_bias.jumps_of_clocks(problem, run, (telemetry.accelerometer, telemetry.rates), both)
-        adaptation = replace(adaptation, jumps=jumps)
-        if jumps:
-            return adaptation
-    if adaptation.rejected_offsets is None:
-        rejected = unsupported_offsets(problem, run, (*both[0].offsets, *both[1].offsets))
-        adaptation = replace(adaptation, rejected_offsets=rejected)
-    return adaptation
-
-
-def bridge_inertial_sensors(telemetry: Telemetry, adaptation: Adaptation = NO_ADAPTATION) -> InertialSensors | None:
-    """Accelerometer and gyros with gaps and rejected readings bridged; None where the flight has none."""
-    records = telemetry.accelerometer, telemetry.rates
-    if records[0] is None or records[1] is None or telemetry.motion.model == "ballistic":
-        return None
-    out = []
-    for number, record in enumerate(r for r in records if r is not None):
-        rejected = tuple(d for d in adaptation.rejected_offsets or () if d.sensor == number)
-        tags = time_bias.with_corrected_tags(record, number, adaptation.jumps or ())
-        out.append(imu_screening.bridge(tags, number, rejected))
-    return InertialSensors(*out)
-
-
-def _mounting(telemetry: Telemetry, sensors: InertialSensors | None) -> Mounting:
-    if sensors is None:
-        return Mounting(telemetry.t0_utc, np.zeros(3), None)
-    arm = sensors.force.spec.position_from_datum_body_m
-    return Mounting(telemetry.t0_utc, arm, sensors.rate)
-
-
-def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adaptation: Adaptation) -> list[Issue]:
-    """What the inertial sensors' samples show by themselves."""
-    findings = [] if sensors is None else [*sensors.force.findings, *sensors.rate.findings]
-    if telemetry.drag_accelerometer is not None:
-        findings += imu_screening.frozen_findings(telemetry.drag_accelerometer)
-    if sensors is not None:
-        findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
-    return findings
-
-
-def _series(
-    problem: Problem, sensors: InertialSensors | None, states: States, smoothed: Smoothed
-) -> tuple[FloatArray, ...]:
-    """Corrected specific force and rates with their times, and at kept nodes how well both are known."""
-    if sensors is None:
-        return tuple(np.empty(s) for s in ((0,), (0, 3), (0, 3), (0, 3, 3), (0, 3, 3), (0, 6, 9), (0, 9, 18)))
-    series = corrected_series(problem, sensors.force, sensors.rate, states)
-    known = (specific_force_cov, rate_cov, accelerometer_root, triad_root)
-    return (*series, *(make(problem, states, smoothed.triangles) for make in known))
-
-
-def _iterate(
-    problem: Problem, settings: Settings, report: Progress
-) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...], SpinPhase | None]:
-    """Problem with its radars' lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations.
-
-    Last, what the phase of a fast spin was chosen from.
-    """
-    reference, phase = None, None
-    found: tuple[UnmodelledAcceleration, ...] = ()
-    passes = 0 if linearisation.needs_no_reference(problem) else settings.passes
-    if passes > 0:
-        report(0.02, "first passes on thinned data")
-        reference, found, phase = linearisation.first_reference(problem, settings)
-    most, i = max(1, passes), 0
-    while True:
-        share = 0.85 / most
-        report(0.1 + share * i, f"filter, pass {i + 1}")
-        problem = with_servo_lag(problem, reference)
-        run, found = linearisation.follow_track(problem, reference, settings, found)
-        report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run)
-        kept = np.flatnonzero(problem.kept)
-        moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
-        smoothed_states = smoothed.states(run.charts)
-        i += 1
-        if moved.max() < 0.01 or i == most:
-            return problem, run, smoothed, smoothed_states, i, found, phase
-        reference = linearisation.bounded_drivers(problem, smoothed_states)
-        del run, smoothed  # as large as all else together, and the next pass makes its own
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """For moving a node to the datum: epoch, accelerometer from datum (3,), m, and the gyros, if there are."""
-
-    epoch_utc: str
-    arm_body_m: FloatArray
-    rate: BridgedSensor | None
-
-
-def datum_trajectory(problem: Problem, mounting: Mounting, states: States, triangles: FloatArray) -> Trajectory:
-    """Trajectory of the datum at the kept nodes from states at all nodes and packed covariances at the kept ones."""
-    kept = np.flatnonzero(problem.kept)
-    states = states[kept]
-    n, planet = len(kept), problem.motion.planet
-    if mounting.rate is None:
-        covariance = unpacked(triangles, KINEMATIC)
-        covariance[:, 6:9] = 0.0
-        covariance[:, :, 6:9] = 0.0
-        covariance[:, range(6, 9), range(6, 9)] = np.pi**2 / 3.0  # angles that may be anything
-        if any(i.kind == DECELERATION for i in problem.instruments):
-            covariance[:, 3:6, 3:6] += turned_velocity_cov(states.velocity_ecef_mps, covariance[:, 3:6, 3:6])
-        return Trajectory(
-            mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m, states.velocity_ecef_mps,
-            states.q_ecef_body, np.tile(planet.rate_ecef_radps, (n, 1)), covariance, planet,
-        )  # fmt: skip
-    motion = problem.motion
-    rate, errors = mounting.rate, states.sensor_errors[:, 9:18]
-    tagged = problem.time_s[kept] + (states.sensor_errors[:, 19] if motion.clocks else 0.0)
-    step = float(np.median(np.diff(rate.time_s)))
-    before, measured, after = (
-        interpolate_rows(at, rate.time_s, rate.measured_sensor) for at in (tagged - step, tagged, tagged + step)
-    )
-    slope = (after - before) / (2.0 * step)
-    c = rotations.dcm_from_q(states.q_ecef_body)
-    omega = correct(measured, errors, motion.dcm_body_rate)
-    r = mounting.arm_body_m
-    lever_velocity = np.cross(omega - planet.rate_radps * c[:, 2], r)
-
-    covariance = np.empty((n, 9, 9))
-    for first in range(0, n, _NODES):  # unpacked, the nodes' covariances are the largest of all arrays
-        k = slice(first, first + _NODES)
-        lever = c[k] @ rotations.skew(r)
-        by_gyros = lever @ correction_partials(measured[k], errors[k], motion.dcm_body_rate)
-        move = np.zeros((len(lever), 9, KINEMATIC + motion.drivers))
-        move[:, range(9), range(9)] = 1.0
-        move[:, 0:3, 6:9] = lever
-        move[:, 3:6, 6:9] = c[k] @ rotations.skew(lever_velocity[k])
-        move[:, 3:6, 18:27] = by_gyros
-        if motion.clocks:  # a late tag reads too little of what grows, as a bias would
-            move[:, 3:6, 28] = -np.einsum("nij,nj->ni", by_gyros[:, :, 0:3], slope[k])
-        moved = move @ unpacked(triangles[k], move.shape[2]) @ np.swapaxes(move, 1, 2)
-        moved[:, 3:6, 3:6] += rate.spec.noise_sd**2 * lever @ np.swapaxes(lever, 1, 2)
-        covariance[k] = 0.5 * (moved + np.swapaxes(moved, 1, 2))
-    return Trajectory(
-        mounting.epoch_utc, problem.time_s[kept], "datum", states.position_ecef_m - c @ r,
-        states.velocity_ecef_mps - np.einsum("nij,nj->ni", c, lever_velocity), states.q_ecef_body, omega, covariance,
-        planet,
-    )  # fmt: skip
-
-
-def turned_velocity_cov(velocity_mps: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Second-order part (n, 3, 3) of the covariance of velocities whose size a deceleration gives, not their direction.
-
-    Turned by an unknown lift, a velocity ``V`` that errs by ``c`` across has ``|c|^2 / (2 V)`` less along, of normal
-    ``c`` with covariance ``A`` a mean square of ``(tr(A)^2 + 2 tr(A^2)) / (4 V^2)``; ``V^2`` is that of both parts.
-    """
-    square = np.sum(velocity_mps**2, axis=1)
-    along = velocity_mps / np.sqrt(square)[:, None]
-    outer = along[:, :, None] * along[:, None, :]
-    across = np.eye(3) - outer
-    left = across @ covariance @ across
-    trace = np.trace(left, axis1=1, axis2=2)
-    mean = (trace**2 + 2.0 * np.sum(left**2, axis=(1, 2))) / (4.0 * (square + trace))
-    return np.asarray(mean[:, None, None] * outer)
-
-
-def corrected_series(
-    problem: Problem, force: BridgedSensor, rate: BridgedSensor, states: States
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times (k,), corrected specific force and rate (k, 3), body axes, at accelerometer samples that both measure."""
-    t = force.time_s
-    k = np.clip(np.searchsorted(rate.time_s, t, side="right") - 1, 0, len(rate.time_s) - 1)
-    # the sample from which a gap begins is measured; one of the other's bridge may have its time
-    in_rate_gap = rate.in_gap[k] & (rate.of_bridge[k] | (t - rate.time_s[k] > 1e-6))
-    keep = ~force.of_bridge & ~in_rate_gap & (t >= problem.time_s[0]) & (t <= problem.time_s[-1])
-    t, measured_force = t[keep], force.measured_sensor[keep]
-    specific_force, rates = np.empty((2, len(t), 3))
-    for first in range(0, len(t), _BLOCK):  # eighteen errors a sample are six times the samples
-        part = slice(first, first + _BLOCK)
-        errors = interpolate_rows(t[part], problem.time_s, states.sensor_errors[:, :18])
-        specific_force[part] = correct(measured_force[part], errors[:, 0:9], problem.motion.dcm_body_force)
-        measured_rate = interpolate_rows(t[part], rate.time_s, rate.measured_sensor)
-        rates[part] = correct(measured_rate, errors[:, 9:18], problem.motion.dcm_body_rate)
-    return t, specific_force, rates
-
-
-def _force_partials(problem: Problem, states: States) -> FloatArray:
-    """Partials (k, 3, 9) of the corrected specific force at kept nodes by the accelerometer's errors."""
-    measured = problem.motion.force_sensor_mps2[problem.node_index[problem.kept]]
-    return correction_partials(measured, states.sensor_errors[problem.kept, 0:9], problem.motion.dcm_body_force)
-
-
-def _rate_partials(problem: Problem, states: States) -> FloatArray:
-    """Partials (k, 3, 9) of the corrected rates at kept nodes by the gyros' errors."""
-    measured = problem.motion.rate_sensor_radps[problem.node_index[problem.kept]]
-    return correction_partials(measured, states.sensor_errors[problem.kept, 9:18], problem.motion.dcm_body_rate)
-
-
-def specific_force_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
-    """Systematic error covariance (k, 3, 3) of the corrected specific force at kept nodes, body axes, (m/s^2)^2."""
-    partials = _force_partials(problem, states)
-    covariance = unpacked(triangles, 18)[:, 9:18, 9:18]
-    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
-
-
-def accelerometer_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
-    """Response (k, 6, 9) of rotation error and specific force error, body axes, at kept nodes to nine unit normals.
-
-    The nine stand for the accelerometer's constant errors: ``root @ root.T`` of the lower rows is the covariance of
-    the corrected specific force, the upper rows are the part of the attitude's error correlated with them.
-    Gauss-Markov errors are taken as they are at mid-span.
-    """
-    attitude, root = _constant_errors(unpacked(triangles, 18))
-    return np.concatenate([attitude, _force_partials(problem, states) @ root], axis=1)
-
-
-def _constant_errors(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Responses of rotation (k, 3, m) and of the m errors behind the motion (m, m) to unit normals, at mid-span."""
-    variance, axes = np.linalg.eigh(covariance[len(covariance) // 2, 9:, 9:])
-    sd = np.sqrt(np.maximum(variance, 0.0))
-    inverse = np.divide(1.0, sd, out=np.zeros(len(sd)), where=sd > 1e-12)
-    return covariance[:, 6:9, 9:] @ (axes * inverse), axes * sd
-
-
-def triad_root(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
-    """Response (k, 9, 18) of rotation, specific force and rate errors, body axes, at kept nodes to unit normals.
-
-    As `accelerometer_root`, of the constant errors of accelerometer and gyros together: what a gyro's mounting does to
-    the attitude rolls with the vehicle.
-    """
-    force, rate = _force_partials(problem, states), _rate_partials(problem, states)
-    attitude, root = _constant_errors(unpacked(triangles, 27))
-    return np.concatenate([attitude, force @ root[0:9], rate @ root[9:18]], axis=1)
-
-
-def rate_cov(problem: Problem, states: States, triangles: FloatArray) -> FloatArray:
-    """Systematic error covariance (k, 3, 3) of the corrected rates at kept nodes, body axes, (rad/s)^2."""
-    partials = _rate_partials(problem, states)
-    covariance = unpacked(triangles, 27)[:, 18:27, 18:27]
-    return np.asarray(partials @ covariance @ np.swapaxes(partials, 1, 2))
-
-
-def sensor_error_table(problem: Problem, states: States, smoothed: Smoothed) -> pd.DataFrame:
-    """Prior and posterior of every error; of Gauss-Markov errors, the value at mid-span."""
-    kept = np.flatnonzero(problem.kept)
-    row = len(kept) // 2
-    model = problem.model
-    return pd.DataFrame(
-        {
-            "name": model.names,
-            "unit": model.units,
-            "treated": np.where(model.wander.considered, "considered", "estimated"),
-            "prior_sd": model.prior_sd,
-            "estimate": states.sensor_errors[kept[row]],
-            "sd": np.sqrt(smoothed.variance[row, 9:]),
-        }
-    )
+    return setup.build_problem(telemetry, coarse, sensors, known.rejected_points)

@@ -11,8 +11,8 @@ from flightmodel import earth, rotations
 from postflight.flight import Flight
 from postflight.reconstruction import DEPENDENCE, attitude_table, check_attitude, reconstruction_from
 from postflight.run_folder import attitude_summary
+from recon.estimate import estimate
 from recon.fault_isolation import isolate_faults
-from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 
 SETTINGS = Settings(output_rate_hz=10.0)
@@ -25,7 +25,7 @@ def telemetry(mini_flight):
 
 @pytest.fixture(scope="module")
 def bet(telemetry):
-    return reconstruct_once(telemetry, SETTINGS)
+    return estimate(telemetry, SETTINGS)
 
 
 @pytest.fixture(scope="module")

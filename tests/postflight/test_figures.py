@@ -25,7 +25,7 @@ from postflight.plots.trajectory import (
 )
 from postflight.reconstruction import check_attitude, reconstruction_from
 from postflight.sensitivity import sensitivity
-from recon.reconstruct import reconstruct_once
+from recon.estimate import estimate
 from recon.settings import Settings
 
 
@@ -37,7 +37,7 @@ def flight(mini_flight):
     track = north.range_az_el.copy()
     track[50::100, 0] += 1000.0
     telemetry = replace(telemetry, radars=telemetry.radars | {"north": replace(north, range_az_el=track)})
-    bet = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
+    bet = estimate(telemetry, Settings(output_rate_hz=5.0))
     return replace(reconstruction_from(Flight(telemetry), bet), attitude=check_attitude(telemetry, bet))
 
 
@@ -48,7 +48,7 @@ def ballistic(mini_flight):
     bare = dict.fromkeys(("accelerometer", "rates", "magnetometer", "sun", "vehicle", "attitude_prior"))
     motion = Motion("ballistic", 0.05)
     telemetry = replace(telemetry, **bare, gnss={}, barometers={}, motion=motion)
-    return reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, Settings(output_rate_hz=5.0, passes=1)))
+    return reconstruction_from(Flight(telemetry), estimate(telemetry, Settings(output_rate_hz=5.0, passes=1)))
 
 
 def drawn(figure, path):

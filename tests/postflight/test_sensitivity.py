@@ -13,8 +13,8 @@ from postflight import sensitivity as module
 from postflight.flight import Flight, read_flight
 from postflight.reconstruction import reconstruct, reconstruction_from
 from postflight.sensitivity import COLUMNS, UNITS, largest_of_groups, reruns, sensitivity
+from recon.estimate import estimate
 from recon.fault_isolation import Adaptation
-from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 
 
@@ -32,7 +32,7 @@ def table(short):
 def pulse(mini_flight):
     """Two radars and inertial sensors through a pulse of 8 g."""
     telemetry = replace(mini_flight(3), gnss={}, barometers={}, magnetometer=None, sun=None)
-    return reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, Settings(output_rate_hz=5.0)))
+    return reconstruction_from(Flight(telemetry), estimate(telemetry, Settings(output_rate_hz=5.0)))
 
 
 def rows(table, rerun):
@@ -73,7 +73,7 @@ def test_the_only_tracker_is_refused_and_the_rest_goes_on(short):
     assert len(lone) == 1
     assert lone["quantity"].isna().all()
     with pytest.raises(GateError) as refusal:
-        reconstruct_once(telemetry, Settings(without=("north",)))
+        estimate(telemetry, Settings(without=("north",)))
     assert lone.reason.iloc[0] == str(refusal.value)
     assert "without north" not in set(largest_of_groups(found).rerun)
     assert len(rows(found, "winds off")) > 5
@@ -83,7 +83,7 @@ def test_a_rerun_that_diverges_is_a_row_with_its_reason(pulse, monkeypatch):
     def fails(telemetry, settings, adaptation):
         raise GateError("left the atmosphere")
 
-    monkeypatch.setattr(module, "reconstruct_once", fails)
+    monkeypatch.setattr(module, "estimate", fails)
     found = sensitivity(pulse)
     assert list(found[found.quantity.isna()].rerun) == ["without north", "without west"]
     assert set(found[found.quantity.isna()].reason) == {"left the atmosphere"}
@@ -109,7 +109,7 @@ def test_leaving_data_out_moves_the_answer_as_far_as_the_covariances_allow(mini_
     squares: dict[tuple[str, str], list[float]] = {}
     for seed in range(count):
         telemetry = replace(mini_flight(seed), gnss={})
-        flight = reconstruction_from(Flight(telemetry), reconstruct_once(telemetry, settings))
+        flight = reconstruction_from(Flight(telemetry), estimate(telemetry, settings))
         found = sensitivity(flight)
         for row in found[found.change_over_expected_sd.notna()].itertuples():
             squares.setdefault((row.rerun, row.quantity), []).append(row.change_over_expected_sd**2)
@@ -143,9 +143,9 @@ def test_reruns_start_from_the_base_s_adaptation(pulse, monkeypatch):
 
     def spy(telemetry, settings, adaptation):
         seen.append(adaptation)
-        return reconstruct_once(telemetry, settings, adaptation=adaptation)
+        return estimate(telemetry, settings, adaptation=adaptation)
 
-    monkeypatch.setattr(module, "reconstruct_once", spy)
+    monkeypatch.setattr(module, "estimate", spy)
     found = sensitivity(base)
     assert seen == [adaptation, adaptation]
     wide = rows(found, "without north")

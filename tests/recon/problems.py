@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.reconstruct import bridge_inertial_sensors
+from recon.estimate import bridge_inertial_sensors
 from recon.settings import Settings
 from recon.setup import build_problem
 from recon.state import unpacked

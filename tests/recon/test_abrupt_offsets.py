@@ -7,9 +7,9 @@ import pytest
 
 from flightmodel.telemetry import TriadRecord
 from recon.ekf import forward
+from recon.estimate import bridge_inertial_sensors, estimate
 from recon.fault_detection import unsupported_offsets, window_scores
 from recon.imu_screening import _REACH, TransientOffset, bridge, repeated_samples, transient_offsets
-from recon.reconstruct import bridge_inertial_sensors, reconstruct_once
 from recon.settings import Settings
 from recon.setup import build_problem
 from tests.oracles import bryson_frazier
@@ -148,14 +148,14 @@ def test_a_fault_is_rejected_and_the_next_reconstruction_starts_from_that(mini_s
     x = force.measured_sensor.copy()
     x[(force.time_s > 126.0) & (force.time_s < 128.0), 2] += 4.0
     wrong = replace(telemetry, accelerometer=replace(force, measured_sensor=x))
-    found = reconstruct_once(wrong, Settings(output_rate_hz=5.0))
+    found = estimate(wrong, Settings(output_rate_hz=5.0))
     (rejected,) = found.adaptation.rejected_offsets
     assert (rejected.sensor, rejected.axis) == (0, 2)
     assert rejected.offset == pytest.approx(4.0, abs=0.5)
     assert "transient-offset" in {f.code for f in found.findings}
-    again = reconstruct_once(wrong, Settings(output_rate_hz=5.0), adaptation=found.adaptation)
+    again = estimate(wrong, Settings(output_rate_hz=5.0), adaptation=found.adaptation)
     assert np.array_equal(again.smoothed.position_ecef_m, found.smoothed.position_ecef_m)
-    clean = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
+    clean = estimate(telemetry, Settings(output_rate_hz=5.0))
     assert clean.adaptation.rejected_offsets == ()
 
 

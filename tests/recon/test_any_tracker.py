@@ -12,7 +12,7 @@ from flightmodel import earth, rotations
 from flightmodel.atmosphere import standard_sounding
 from flightmodel.instruments import GnssSpec, RadarSite
 from flightmodel.telemetry import GnssRecord, Motion, RadarRecord, Telemetry
-from recon.reconstruct import reconstruct_once
+from recon.estimate import estimate
 from recon.settings import Settings
 from recon.setup import track_points, tracking_instruments
 from tests.refusing import refuses
@@ -113,7 +113,7 @@ def bound(sites):
 
 def test_two_telescopes_are_stated_as_well_as_the_cramer_rao_bound():
     sites = SITES[:2]
-    _, covariance, rows = off(reconstruct_once(watch(1, sites, ("az", "el")), QUICK))
+    _, covariance, rows = off(estimate(watch(1, sites, ("az", "el")), QUICK))
     sd, least = (np.sqrt(np.diagonal(p, axis1=1, axis2=2)) for p in (covariance, bound(sites)[rows]))
     ratio = sd / least
     # process noise and the air's drivers are there, as small as they are
@@ -128,7 +128,7 @@ def test_two_telescopes_reach_the_cramer_rao_bound(record_property):
     least = np.diagonal(bound(sites), axis1=1, axis2=2)
     squares = []
     for seed in range(60):
-        error, _, rows = off(reconstruct_once(watch(100 + seed, sites, ("az", "el")), QUICK))
+        error, _, rows = off(estimate(watch(100 + seed, sites, ("az", "el")), QUICK))
         squares.append(np.mean(error**2 / least[rows]))
     ratio = float(np.sqrt(np.mean(squares)))
     uncertain = float(np.std(squares, ddof=1) / np.sqrt(len(squares)) / (2.0 * ratio))
@@ -150,7 +150,7 @@ def assert_errors_as_stated(telemetry_of):
     """Half-way states of six flights err as their covariances say; the residuals are as large as predicted."""
     squares, seeds = 0.0, range(6)
     for seed in seeds:
-        solution = reconstruct_once(telemetry_of(seed), QUICK)
+        solution = estimate(telemetry_of(seed), QUICK)
         assert all(v.passed for v in solution.consistency_checks if v.code in ("nis", "edited"))
         error, covariance, rows = off(solution)
         k = len(rows) // 2
@@ -160,8 +160,8 @@ def assert_errors_as_stated(telemetry_of):
 
 
 def test_doppler_makes_the_velocity_better():
-    plain = off(reconstruct_once(watch(3, SITES[:1], ("range", "az", "el")), QUICK))[1]
-    doppler = off(reconstruct_once(watch(3, SITES[:1], ("range", "az", "el", "range_rate")), QUICK))[1]
+    plain = off(estimate(watch(3, SITES[:1], ("range", "az", "el")), QUICK))[1]
+    doppler = off(estimate(watch(3, SITES[:1], ("range", "az", "el", "range_rate")), QUICK))[1]
     assert np.trace(doppler[20, 3:, 3:]) < 0.9 * np.trace(plain[20, 3:, 3:])
 
 
@@ -170,10 +170,10 @@ def test_noise_of_its_own_for_each_row():
     t = fly(capsule())[0]
     noisy = np.where(np.arange(len(t)) % 2, 10.0, 1.0)
     telemetry = watch(5, SITES[:2], ("az", "el"), noisy)
-    solution = reconstruct_once(telemetry, QUICK)
+    solution = estimate(telemetry, QUICK)
     assert all(v.passed for v in solution.consistency_checks if v.code in ("nis", "edited"))
     untold = replace(telemetry, radars={n: replace(r, sd=None) for n, r in telemetry.radars.items()})
-    assert not all(v.passed for v in reconstruct_once(untold, QUICK).consistency_checks)
+    assert not all(v.passed for v in estimate(untold, QUICK).consistency_checks)
     least = bound(SITES[:2])
     _, covariance, rows = off(solution)
     ratio = np.sqrt(np.trace(covariance[20, :3, :3]) / np.trace(least[rows][20, :3, :3]))
@@ -199,8 +199,7 @@ def test_velocities_alone_help_and_err_as_stated():
 
     assert_errors_as_stated(with_velocities)
     with_it, plain = (
-        off(reconstruct_once(telemetry, QUICK))[1]
-        for telemetry in (with_velocities(5), watch(5, SITES[:2], ("az", "el")))
+        off(estimate(telemetry, QUICK))[1] for telemetry in (with_velocities(5), watch(5, SITES[:2], ("az", "el")))
     )
     k = len(plain) // 2
     assert np.trace(with_it[k, 3:, 3:]) < 0.5 * np.trace(plain[k, 3:, 3:])
@@ -210,9 +209,9 @@ def test_noise_of_its_own_for_each_velocity():
     noisy = np.where(np.arange(len(fly(capsule())[0])) % 2, 10.0, 1.0)
     telemetry = watch(5, SITES[:2], ("az", "el"))
     own = replace(telemetry, gnss={"gps": receiver(5, 0.02, noisy)})
-    assert all(v.passed for v in reconstruct_once(own, QUICK).consistency_checks if v.code in ("nis", "edited"))
+    assert all(v.passed for v in estimate(own, QUICK).consistency_checks if v.code in ("nis", "edited"))
     one_for_all = replace(own, gnss={"gps": replace(own.gnss["gps"], sd=None)})
-    assert {v.source for v in reconstruct_once(one_for_all, QUICK).consistency_checks if not v.passed} == {"gps"}
+    assert {v.source for v in estimate(one_for_all, QUICK).consistency_checks if not v.passed} == {"gps"}
 
 
 def test_points_are_where_rays_and_ranges_meet():
@@ -227,7 +226,7 @@ def test_points_are_where_rays_and_ranges_meet():
 
 def test_one_telescope_alone_is_refused():
     with refuses("too-few-data"):
-        reconstruct_once(watch(1, SITES[:1], ("az", "el")), QUICK)
+        estimate(watch(1, SITES[:1], ("az", "el")), QUICK)
 
 
 # after the last measurement
@@ -240,7 +239,7 @@ def test_the_trajectory_is_carried_on_with_growing_sd():
         seen = {
             n: replace(r, time_s=r.time_s[:100], range_az_el=r.range_az_el[:100]) for n, r in telemetry.radars.items()
         }
-        bet = reconstruct_once(replace(telemetry, radars=seen), replace(QUICK, carry_on_s=15.0))
+        bet = estimate(replace(telemetry, radars=seen), replace(QUICK, carry_on_s=15.0))
         assert bet.smoothed.time_s[-1] == pytest.approx(telemetry.radars["uintah"].time_s[99] + 15.0, abs=1.0)
         error, covariance, _ = off(bet)
         squares += error[-1] @ np.linalg.solve(covariance[-1], error[-1])

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from flightmodel.trajectory import difference
-from recon.reconstruct import reconstruct_once
+from recon.estimate import estimate
 from recon.settings import Settings
 
 from .problems import build
@@ -21,7 +21,7 @@ def flown(mini_sense):
     out = []
     for seed in SEEDS:
         late_s = SD_S * np.random.default_rng([seed, 1]).standard_normal(2)
-        out.append((reconstruct_once(mini_sense(seed, clock_sd_s=SD_S)[0], Settings(output_rate_hz=5.0)), late_s))
+        out.append((estimate(mini_sense(seed, clock_sd_s=SD_S)[0], Settings(output_rate_hz=5.0)), late_s))
     return out
 
 

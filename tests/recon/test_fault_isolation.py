@@ -9,6 +9,7 @@ import pytest
 from flightmodel.checks import Check
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference
+from recon.estimate import estimate
 from recon.fault_isolation import (
     LeftOut,
     edit_checks_with_rejected,
@@ -17,7 +18,7 @@ from recon.fault_isolation import (
     rejected_point_findings,
     rejected_points,
 )
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 
 FAST = Settings(output_rate_hz=5.0)
@@ -44,7 +45,7 @@ def test_azimuth_bias_far_beyond_its_sd_is_paid_for(mini_sense, mini_truth, name
     """0.1 deg where 0.005 or less is stated: the filter keeps to north, and the truth is inside the answer anyhow."""
     telemetry, _ = mini_sense(40)
     wrong = spoiled(telemetry, name, azimuth=np.deg2rad(0.1))
-    before, after = reconstruct_once(wrong, FAST), reconstruct(wrong, FAST)
+    before, after = estimate(wrong, FAST), reconstruct(wrong, FAST)
     assert np.array_equal(before.smoothed.position_ecef_m, after.smoothed.position_ecef_m)
     assert any(not v.passed for v in after.consistency_checks)
     assert max(s.distance_m for s in after.left_out) > 50.0
@@ -59,7 +60,7 @@ def test_good_flights_are_not_run_again(mini_sense):
     found = reconstruct(telemetry, FAST)
     assert not found.left_out
     assert not isolate_faults(found.consistency_checks, found.left_out)
-    assert np.array_equal(found.smoothed.covariance, reconstruct_once(telemetry, FAST).smoothed.covariance)
+    assert np.array_equal(found.smoothed.covariance, estimate(telemetry, FAST).smoothed.covariance)
 
 
 def test_late_time_tags_of_one_radar_are_laid_on_it(mini_sense, mini_truth):

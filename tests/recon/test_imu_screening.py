@@ -9,8 +9,8 @@ import pytest
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
 from recon.atmosphere import HALF_WINDOW_S, _air_samples, windows_are_whole
+from recon.estimate import corrected_series
 from recon.imu_screening import bridge, frozen_samples
-from recon.reconstruct import corrected_series
 from tests.refusing import refuses
 
 SPEC = TriadSpec("rates", np.zeros(3), np.eye(3), 0.01, 0.01, 0.003, 0.002)

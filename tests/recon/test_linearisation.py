@@ -9,8 +9,8 @@ import pytest
 
 from flightmodel.trajectory import difference
 from recon import linearisation, propagation
+from recon.estimate import estimate
 from recon.linearisation import SpinPhase
-from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 
 SCALE_SD = 0.1  # of a vehicle that turns six times: an angle of 1.9 rad at the peak of the force
@@ -34,7 +34,7 @@ def errors_of(truth, solution):
 
 @pytest.mark.parametrize("scale", [-0.16, 0.15, 0.23])
 def test_a_scale_that_miscounts_the_turns_is_found(mini_sense, mini_truth, scale):
-    solution = reconstruct_once(with_scale(mini_sense(5)[0], scale), SETTINGS)
+    solution = estimate(with_scale(mini_sense(5)[0], scale), SETTINGS)
     error, square = errors_of(mini_truth, solution)
     table = solution.sensor_errors.set_index("name")
     found, sd = table.loc["rates scale x", ["estimate", "sd"]]
@@ -58,10 +58,10 @@ def test_a_long_flight_s_coarse_parts_lead_to_the_same_phase(mini_sense, monkeyp
 
     monkeypatch.setattr(propagation, "decimated", seen)
     telemetry = with_scale(mini_sense(5)[0], 0.15)
-    fine = reconstruct_once(telemetry, SETTINGS)
+    fine = estimate(telemetry, SETTINGS)
     assert not nodes
     monkeypatch.setattr(linearisation, "_COARSE_NODES", 40)
-    coarse = reconstruct_once(telemetry, SETTINGS)
+    coarse = estimate(telemetry, SETTINGS)
     ((few, whole, kept),) = nodes
     assert few < 60
     assert kept < 0.5 * whole
@@ -101,13 +101,13 @@ def test_decimated_motion_keeps_nodes_integrals_and_noise():
 
 def test_without_the_parts_the_filter_takes_another_phase(mini_sense, mini_truth, monkeypatch):
     monkeypatch.setattr(linearisation, "_chosen_phase", lambda _problem, _engine: (None, None))
-    solution = reconstruct_once(with_scale(mini_sense(5)[0], 0.23), SETTINGS)
+    solution = estimate(with_scale(mini_sense(5)[0], 0.23), SETTINGS)
     error, square = errors_of(mini_truth, solution)
     assert np.abs(error).max() > np.deg2rad(30.0) or np.median(square) > 60.0
 
 
 def test_a_slow_or_well_known_spin_is_linearised_once(mini_sense):
-    solution = reconstruct_once(mini_sense(5)[0], SETTINGS)
+    solution = estimate(mini_sense(5)[0], SETTINGS)
     assert not [c for c in solution.consistency_checks if c.code == "spin-phase"]
 
 

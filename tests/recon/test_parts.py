@@ -11,9 +11,10 @@ from flightmodel import earth, rotations
 from flightmodel.instruments import ACCELEROMETER, GnssSpec, TriadSpec
 from flightmodel.telemetry import GnssRecord, TriadRecord
 from flightmodel.trajectory import Trajectory, difference
-from recon import reconstruct
+from recon import estimate
 from recon.consistency import source_checks
 from recon.entry_density import _spread, drag_jump_check, temperature_check
+from recon.estimate import Mounting, corrected_series, datum_trajectory, turned_velocity_cov
 from recon.fault_isolation import _compared
 from recon.imu_screening import (
     _bridges,
@@ -26,7 +27,6 @@ from recon.imu_screening import (
 )
 from recon.measurements import RADAR, gnss_instruments, magnetometer_instrument
 from recon.propagation import strapdown_motion, with_disturbances, with_exact_integrals
-from recon.reconstruct import Mounting, corrected_series, datum_trajectory, turned_velocity_cov
 from recon.setup import fit_start
 from recon.state import States, boxplus, instrument_blocks, packed
 from recon.vector_attitude import _inconsistent_sensors, compare
@@ -328,7 +328,7 @@ def test_readings_corrected_in_blocks_are_those_corrected_at_once(monkeypatch):
     )
     states = SimpleNamespace(sensor_errors=0.01 * rng.normal(size=(6, 20)))
     at_once = corrected_series(problem, force, rate, states)
-    monkeypatch.setattr(reconstruct, "_BLOCK", 7)
+    monkeypatch.setattr(estimate, "_BLOCK", 7)
     for whole, parts in zip(at_once, corrected_series(problem, force, rate, states), strict=True):
         np.testing.assert_array_equal(parts, whole)
 

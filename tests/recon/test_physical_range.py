@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.estimate import estimate
 from recon.fault_isolation import isolate_faults
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 
 DEG = np.pi / 180.0
@@ -29,7 +30,7 @@ def ranges(solution):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_refraction_that_is_left_is_possible(mini_sense, seed):
-    solution = reconstruct_once(planted(mini_sense(seed)[0], refraction=0.7, refraction_sd=1.0), QUICK)
+    solution = estimate(planted(mini_sense(seed)[0], refraction=0.7, refraction_sd=1.0), QUICK)
     assert ranges(solution)["refraction"].passed
     row = solution.sensor_errors.set_index("name").loc["north refraction"]
     assert abs(row.estimate - 0.7) < 4.0 * row.sd
@@ -47,10 +48,10 @@ def test_droop_taken_for_negative_refraction_is_named(mini_sense):
 
 def test_stated_droop_leaves_refraction_possible(mini_sense):
     telemetry = planted(mini_sense(3)[0], droop_rad=-0.06 * DEG, refraction_sd=1.0, droop_sd_rad=0.06 * DEG)
-    assert ranges(reconstruct_once(telemetry, QUICK))["refraction"].passed
+    assert ranges(estimate(telemetry, QUICK))["refraction"].passed
 
 
 def test_what_is_not_estimated_is_not_judged(mini_sense):
-    assert not ranges(reconstruct_once(mini_sense(1)[0], QUICK))
+    assert not ranges(estimate(mini_sense(1)[0], QUICK))
     considered = replace(QUICK, consider=("north refraction",))
-    assert not ranges(reconstruct_once(planted(mini_sense(1)[0], refraction_sd=1.0), considered))
+    assert not ranges(estimate(planted(mini_sense(1)[0], refraction_sd=1.0), considered))

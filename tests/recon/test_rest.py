@@ -5,7 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from flightmodel.telemetry import find_rest
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.estimate import estimate
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from tests.recon import pad_flight
 from tests.recon.pad_flight import DEG, REST, off, sense
@@ -41,7 +42,7 @@ def test_errors_are_as_large_as_stated_on_the_pad_and_after():
     squares = dict.fromkeys((-4.0, -0.5, 5.0, 20.0), 0.0)
     seeds = range(8)
     for seed in seeds:
-        bet = reconstruct_once(sense(seed), QUICK).smoothed
+        bet = estimate(sense(seed), QUICK).smoothed
         for at in squares:
             error, covariance = off(bet, at)
             squares[at] += error @ np.linalg.solve(covariance, error)
@@ -63,7 +64,7 @@ def test_errors_are_as_large_as_stated_on_the_pad_and_after():
 def test_attitude_from_the_rest_alone(how, most_deg):
     squares, seeds = 0.0, range(3)
     for seed in seeds:
-        bet = reconstruct_once(sense(seed, prior_sd_deg=None, **how), QUICK).smoothed
+        bet = estimate(sense(seed, prior_sd_deg=None, **how), QUICK).smoothed
         error, covariance = off(bet, -1.0)
         squares += error[6:9] @ np.linalg.solve(covariance[6:9, 6:9], error[6:9])
         assert np.sqrt(covariance[6, 6]) < most_deg * DEG
@@ -72,7 +73,7 @@ def test_attitude_from_the_rest_alone(how, most_deg):
 
 def test_a_heading_that_nothing_gives_is_refused():
     with refuses("heading-unknown"):
-        reconstruct_once(sense(1, prior_sd_deg=None), QUICK)
+        estimate(sense(1, prior_sd_deg=None), QUICK)
 
 
 def test_a_weak_accelerometer_is_red_by_name():

@@ -10,9 +10,10 @@ from flightmodel import instruments
 from flightmodel.checks import GateError
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import GnssRecord, RadarRecord, TriadRecord
+from recon.estimate import bridge_inertial_sensors
 from recon.measurements import RADAR, RANGE_RATE, VELOCITY
 from recon.propagation import inertial_motion
-from recon.reconstruct import bridge_inertial_sensors, reconstruct
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import ErrorModel, instrument_blocks
 

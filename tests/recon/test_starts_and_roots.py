@@ -9,9 +9,10 @@ from scipy.stats import norm
 
 from flightmodel import earth, rotations
 from recon import atmosphere, fault_detection, setup
+from recon.estimate import accelerometer_root
 from recon.imu_screening import TransientOffset
 from recon.propagation import correct
-from recon.reconstruct import accelerometer_root, reconstruct
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import packed
 

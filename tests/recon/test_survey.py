@@ -10,8 +10,9 @@ from flightmodel import earth
 from flightmodel.instruments import BarometerSpec, GnssSpec, SitesSpec
 from flightmodel.telemetry import KnownPlace
 from recon import survey
+from recon.estimate import estimate
 from recon.fault_isolation import isolate_faults
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from tests.recon.conftest import SITES, measure_barometer, measure_gnss
 
@@ -132,7 +133,7 @@ def test_stated_errors_of_the_sites_are_in_the_covariance(mini_truth, mini_sense
             lat, lon, height = (float(x) for x in earth.geodetic_from_ecef(stated))
             site = replace(s, latitude_rad=lat, longitude_rad=lon, height_m=height, **own)
             radars[name] = replace(record, spec=site, range_az_el=record.range_az_el + np.array([0.0, e[3], 0.0]))
-        bet = reconstruct_once(replace(telemetry, radars=radars, sites=common), QUICK).smoothed
+        bet = estimate(replace(telemetry, radars=radars, sites=common), QUICK).smoothed
         k = len(bet.time_s) // 2
         off = (bet.position_ecef_m - mini_truth.trajectory(bet.time_s).position_ecef_m)[k]
         squares.append(off @ np.linalg.solve(bet.covariance[k, :3, :3], off))

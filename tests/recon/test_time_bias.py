@@ -8,8 +8,8 @@ import pytest
 from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
 from recon import time_bias
+from recon.estimate import estimate
 from recon.imu_screening import bridge
-from recon.reconstruct import reconstruct_once
 from recon.settings import Settings
 from recon.state import States
 from recon.time_bias import ClockJump, lag_between, with_corrected_tags
@@ -106,7 +106,7 @@ def test_tags_are_set_back_behind_a_jump_or_forward_before_it():
 def test_trackers_tell_a_jump_from_lost_samples(mini_sense, sensors, early):
     """8 g are felt when they come: 40 ms late from mid-pulse on, or early until then, is seen from the ground."""
     telemetry, _ = mini_sense(3, clock_sd_s=1e-3)
-    clean = reconstruct_once(telemetry, Settings(output_rate_hz=5.0))
+    clean = estimate(telemetry, Settings(output_rate_hz=5.0))
     records = [telemetry.accelerometer, telemetry.rates]
     lost, jumped = list(records), list(records)
     for k in sensors:
@@ -115,8 +115,7 @@ def test_trackers_tell_a_jump_from_lost_samples(mini_sense, sensors, early):
         lost[k] = replace(r, time_s=r.time_s[~gone], measured_sensor=r.measured_sensor[~gone])
         jumped[k] = replace(r, time_s=r.time_s + 0.04 * ((r.time_s > 130.0) - float(early)))
     found = [
-        reconstruct_once(replace(telemetry, accelerometer=a, rates=w), Settings(output_rate_hz=5.0))
-        for a, w in (lost, jumped)
+        estimate(replace(telemetry, accelerometer=a, rates=w), Settings(output_rate_hz=5.0)) for a, w in (lost, jumped)
     ]
     assert clean.adaptation.jumps == ()
     assert found[0].adaptation.jumps == ()

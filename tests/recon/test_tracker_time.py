@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from flightmodel.instruments import GnssSpec
+from recon.estimate import estimate
 from recon.fault_isolation import isolate_faults
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from tests.recon.conftest import END, START, measure_gnss
 from tests.recon.test_fault_isolation import nees, spoiled
@@ -51,7 +52,7 @@ def test_a_lag_of_seconds_is_found_and_judged_by_what_is_stated(late_s, red, wit
     assert check.value == pytest.approx(row.estimate / row.prior_sd)
     assert row.prior_sd == 0.5
     assert [f.source for f in bet.findings if f.code == "clock-corrected"] == ["gps"]
-    again = reconstruct_once(telemetry, FAST, adaptation=bet.adaptation)  # as what is compared with it is made
+    again = estimate(telemetry, FAST, adaptation=bet.adaptation)  # as what is compared with it is made
     np.testing.assert_array_equal(again.smoothed.position_ecef_m, bet.smoothed.position_ecef_m)
 
 
@@ -67,7 +68,7 @@ def test_tags_that_are_right_are_left(with_receiver):
     bet = reconstruct(telemetry, FAST)
     assert codes(bet) == set()
     assert "clock-corrected" not in {v.code for v in bet.consistency_checks}
-    np.testing.assert_array_equal(bet.smoothed.covariance, reconstruct_once(telemetry, FAST).smoothed.covariance)
+    np.testing.assert_array_equal(bet.smoothed.covariance, estimate(telemetry, FAST).smoothed.covariance)
 
 
 def test_both_radars_that_are_late_are_named_and_set_right(mini_sense, mini_truth):

@@ -10,8 +10,9 @@ from flightmodel import earth
 from flightmodel.checks import ConfigError
 from flightmodel.config import parse_section
 from flightmodel.instruments import RadarEntry
+from recon.estimate import estimate
 from recon.measurements import RADAR, Instrument, servo_lag
-from recon.reconstruct import reconstruct, reconstruct_once
+from recon.reconstruct import reconstruct
 from recon.settings import Settings
 from recon.state import States
 
@@ -87,8 +88,8 @@ def test_stated_it_leaves_the_velocity_true(mini_truth, mini_sense, engine):
     telemetry = mini_sense(4)[0]
     settings = replace(QUICK, engine=engine)
     stated = lagging(telemetry, mini_truth, angle_servo_hz=HZ, servo_lag_sd=0.1)
-    with_it, error = velocity_z(reconstruct_once(stated, settings), mini_truth)
-    without, blurred = velocity_z(reconstruct_once(lagging(telemetry, mini_truth), settings), mini_truth)
+    with_it, error = velocity_z(estimate(stated, settings), mini_truth)
+    without, blurred = velocity_z(estimate(lagging(telemetry, mini_truth), settings), mini_truth)
     assert with_it < 1.6  # rms of a few independent errors of unit variance, 3 sd
     assert without > 2.5
     assert error < 0.4 * blurred
@@ -96,7 +97,7 @@ def test_stated_it_leaves_the_velocity_true(mini_truth, mini_sense, engine):
 
 def test_a_bandwidth_that_is_off_is_estimated(mini_truth, mini_sense):
     stated = lagging(mini_sense(5)[0], mini_truth, angle_servo_hz=1.2 * HZ, servo_lag_sd=0.4)
-    table = reconstruct_once(stated, QUICK).sensor_errors.set_index("name")
+    table = estimate(stated, QUICK).sensor_errors.set_index("name")
     rows = table.loc[[f"{name} servo lag" for name in stated.radars]]
     # the lag goes with the bandwidth to the power of -2, if it is slow
     assert (np.abs(rows.estimate - 0.44) < 4.0 * rows.sd).all()
