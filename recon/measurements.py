@@ -66,7 +66,6 @@ from recon.propagation import ballistic_acceleration, cross_into, level, matmul_
 from recon.state import DRIVERS, ErrorModel, States, right_jacobian
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
-SLOTS = 23
 REST = "rest"  # zero velocities on the pad
 SITES = "sites"  # owner of the errors that are common to all radar sites
 DECELERATION_RATE_HZ = 20.0  # of block means: over 50 ms an entry's deceleration is a straight line to 1e-3 m/s^2
@@ -83,9 +82,23 @@ COMPONENTS = {
 _STATES = instruments.RADAR.states
 _RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
 _OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-2], _STATES[-2:]
+_RADAR_SLOTS = (*_OWN_RADAR, *(f"sites {name}" for name in instruments.SITES.states), *_LAST)
+# slots of a radar's errors, by their names in the instrument's table; of a survey, north, east and height follow
+(
+    RANGE_BIAS, AZIMUTH_BIAS, ELEVATION_BIAS, TIME_BIAS, TILT_NORTH, TILT_EAST, DROOP, SKEW, NON_ORTHOGONALITY,
+    TRAVERSE_WANDER, ELEVATION_WANDER, REFRACTION, RANGE_SCALE, SURVEY, NORTH, SITES_SURVEY, SITES_NORTH, RANGE_WANDER,
+    SERVO_LAG,
+) = (
+    _RADAR_SLOTS.index(name)
+    for name in (
+        "range bias", "azimuth bias", "elevation bias", "time bias", "tilt north", "tilt east", "droop", "skew",
+        "non-orthogonality", "traverse wander", "elevation wander", "refraction", "range scale", "survey north",
+        "north", "sites survey north", "sites north", "range wander", "servo lag",
+    )
+)  # fmt: skip
 # errors that the velocity of a point beside the accelerometer depends on
 _GYROS = (*instruments.RATES.states[:9], "time bias")
-# time biases stand in slot 3, and the directions of Sun heads where the compiled kernels look for them
+# time biases stand in a radar's slot, and the directions of Sun heads where the compiled kernels look for them
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
     RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
     RANGE_RATE: (*_DOPPLER, "", _STATES[3], *_GYROS),
@@ -96,6 +109,7 @@ SLOT_NAMES: dict[int, tuple[str, ...]] = {
     SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
     DECELERATION: ("bias", "scale", "", "time bias", *(name for _, name in DRIVERS)),
 }
+SLOTS = max(map(len, SLOT_NAMES.values()))
 _OWNERS = {DECELERATION: dict(enumerate((owner for owner, _ in DRIVERS), start=4))}  # of slots that are not its own
 _OWNERS |= dict.fromkeys((VELOCITY, RANGE_RATE), dict.fromkeys(range(4, 14), "rates"))
 
@@ -490,7 +504,7 @@ def state_rows(m, count, tau, c, effective, speed, by_state, by_error):
     """Partials of readings with partials ``m`` (3, 3) by the observed point: by state, and by the time tag (slot 3)."""
     row, lever = np.empty(3), np.empty(3)
     for i in range(count):
-        by_error[i, 3] = -(m[i, 0] * speed[0] + m[i, 1] * speed[1] + m[i, 2] * speed[2])
+        by_error[i, TIME_BIAS] = -(m[i, 0] * speed[0] + m[i, 1] * speed[1] + m[i, 2] * speed[2])
         for j in range(3):
             by_state[i, j] = m[i, j]
             by_state[i, 3 + j] = -tau * m[i, j]
@@ -529,7 +543,7 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     site_partials(site, dcm_ned_ecef, ned[0], ned[1], ned[2], moved)
     for i in range(3):
         for j in range(3):
-            ned[i] += moved[i, j] * (e[13 + j] + e[17 + j])
+            ned[i] += moved[i, j] * (e[SURVEY + j] + e[SITES_SURVEY + j])
     north, east, down = ned[0], ned[1], ned[2]
     level2 = north * north + east * east
     horizontal = math.sqrt(level2)
@@ -544,41 +558,39 @@ def predict_radar(site, dcm_ned_ecef, known, e, point, h, m, by_error):
     sin_el, cos_el = -down / slant, horizontal / slant
     sec = 1.0 / max(cos_el, 1e-3)
     tan = sin_el * sec
-    by_error[0, 0], by_error[1, 1], by_error[2, 2] = 1.0, 1.0, 1.0
+    by_error[0, RANGE_BIAS], by_error[1, AZIMUTH_BIAS], by_error[2, ELEVATION_BIAS] = 1.0, 1.0, 1.0
     # a pedestal tilted by (tn, te) about north and east: RCC 753-95, to first order
-    by_error[1, 4], by_error[1, 5] = -cos_az * tan, -sin_az * tan
-    by_error[2, 4], by_error[2, 5] = sin_az, -cos_az
-    by_error[2, 6], by_error[1, 7], by_error[1, 8] = cos_el, sec, tan
-    by_error[1, 9], by_error[2, 10] = sec, 1.0
+    by_error[1, TILT_NORTH], by_error[1, TILT_EAST] = -cos_az * tan, -sin_az * tan
+    by_error[2, TILT_NORTH], by_error[2, TILT_EAST] = sin_az, -cos_az
+    by_error[2, DROOP], by_error[1, SKEW], by_error[1, NON_ORTHOGONALITY] = cos_el, sec, tan
+    by_error[1, TRAVERSE_WANDER], by_error[2, ELEVATION_WANDER] = sec, 1.0
     # refraction of a ray through the whole atmosphere; near the horizon it stays at its value at 2 deg
-    by_error[2, 11] = known[0] * cos_el / max(sin_el, 0.035)
-    by_error[0, 12] = slant
-    by_error[1, 16], by_error[1, 20] = 1.0, 1.0
-    by_error[0, 21] = 1.0
-    by_error[1, 22], by_error[2, 22] = known[1], known[2]
+    by_error[2, REFRACTION] = known[0] * cos_el / max(sin_el, 0.035)
+    by_error[0, RANGE_SCALE] = slant
+    by_error[1, NORTH], by_error[1, SITES_NORTH] = 1.0, 1.0
+    by_error[0, RANGE_WANDER] = 1.0
+    by_error[1, SERVO_LAG], by_error[2, SERVO_LAG] = known[1], known[2]
     # the errors themselves change with azimuth and elevation: near the horizon that of the refraction by a tenth
-    by_tilt = cos_az * e[4] + sin_az * e[5]
+    by_tilt = cos_az * e[TILT_NORTH] + sin_az * e[TILT_EAST]
     cosecant_square = 1.0 / (sin_el * sin_el) if sin_el > 0.035 else sin_el / 0.035
-    g = (
-        (1.0 + e[12], 0.0, 0.0),
-        (0.0, 1.0 - tan * (cos_az * e[5] - sin_az * e[4]),
-         sec * sec * (e[8] - by_tilt) + sec * tan * (e[7] + e[9])),
-        (0.0, by_tilt, 1.0 - sin_el * e[6] - known[0] * cosecant_square * e[11]),
-    )  # fmt: skip
+    turned_az = tan * (cos_az * e[TILT_EAST] - sin_az * e[TILT_NORTH])
+    az_by_el = sec * sec * (e[NON_ORTHOGONALITY] - by_tilt) + sec * tan * (e[SKEW] + e[TRAVERSE_WANDER])
+    bent_el = sin_el * e[DROOP] + known[0] * cosecant_square * e[REFRACTION]
+    g = ((1.0 + e[RANGE_SCALE], 0.0, 0.0), (0.0, 1.0 - turned_az, az_by_el), (0.0, by_tilt, 1.0 - bent_el))
     h[0], h[1], h[2] = slant, math.atan2(east, north) + known[1], math.atan2(-down, horizontal) + known[2]
     for i in range(3):
         for j in range(SLOTS):
-            if j != 3:
+            if j != TIME_BIAS:
                 h[i] += by_error[i, j] * e[j]
     for i in range(3):
         for j in range(3):
             m[i, j] = 0.0
-            by_error[i, 13 + j] = 0.0
+            by_error[i, SURVEY + j] = 0.0
             for k in range(3):
                 f = g[i][0] * p[0][k] + g[i][1] * p[1][k] + g[i][2] * p[2][k]
                 m[i, j] += f * dcm_ned_ecef[k, j]
-                by_error[i, 13 + j] += f * moved[k, j]
-            by_error[i, 17 + j] = by_error[i, 13 + j]
+                by_error[i, SURVEY + j] += f * moved[k, j]
+            by_error[i, SITES_SURVEY + j] = by_error[i, SURVEY + j]
 
 
 def sight(n: Any, east: Any, d: Any) -> tuple[Any, Any, Any]:
@@ -810,7 +822,7 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_sun(dcm, known, e, c, h, by_state, by_error)
         return
     point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    tau, sweep, pulled = e[3], np.empty(3), np.empty(3)
+    tau, sweep, pulled = e[TIME_BIAS], np.empty(3), np.empty(3)
     observed_point(arm, tau, position, velocity, c, rate, acceleration, point, speed, effective, sweep, pulled, planet)
     if kind == RADAR:
         predict_radar(site, dcm, known, e, point, h, m, by_error)
@@ -844,11 +856,11 @@ def predict_range_rate(site, tau, e, c, sweep, pulled, point, speed, effective, 
         m[0, i] = (speed[i] - h[0] * along[0, i]) / slant
     velocity_rows(along, 1, c, sweep, pulled, by_state, by_error)
     swing = by_state[0].copy()
-    late = by_error[0, 3]
+    late = by_error[0, TIME_BIAS]
     state_rows(m, 1, tau, c, effective, speed, by_state, by_error)
     for j in range(3, 9):
         by_state[0, j] += swing[j]
-    by_error[0, 3] += late
+    by_error[0, TIME_BIAS] += late
     by_error[0, 0], by_error[0, 1] = 1.0, 1.0
     h[0] += e[0]
     h[0] += e[1]
@@ -859,7 +871,7 @@ def velocity_rows(m, count, c, sweep, pulled, by_state, by_error):
     """Partials of a velocity along the first axes of ``m`` (3, 3): ``m (v + C (w x d) - tau a_p)``."""
     row, lever = np.empty(3), np.empty(3)
     for i in range(count):
-        by_error[i, 3] = -(m[i, 0] * pulled[0] + m[i, 1] * pulled[1] + m[i, 2] * pulled[2])
+        by_error[i, TIME_BIAS] = -(m[i, 0] * pulled[0] + m[i, 1] * pulled[1] + m[i, 2] * pulled[2])
         for j in range(3):
             by_state[i, 3 + j] = m[i, j]
             row[j] = m[i, 0] * c[0, j] + m[i, 1] * c[1, j] + m[i, 2] * c[2, j]
