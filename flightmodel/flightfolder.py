@@ -73,7 +73,7 @@ from flightmodel.sensor_tables import (
     read_triad,
     with_least_count,
 )
-from flightmodel.tables import GNSS_SD, Source, Spans
+from flightmodel.tables import GNSS_SD, Source, Spans, times_s
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
@@ -607,14 +607,20 @@ def _films(gate: Gate, spec: FlightFile, vehicle: Vehicle | None) -> dict[str, F
 
 def _loads(gate: Gate, entry: LoadsEntry) -> LoadsTable | None:
     """Table of loads where it lies; None, with a fault kept, where there is none that may be read."""
-    path = gate.path(entry.file)
-    if path is not None and not path.is_file():
+    path, time_s = gate.path(entry.file), None
+    if path is None:
+        return None
+    if not path.is_file():
         gate.refuse(f"loads: {path}: {nothing_at(path)}", "file-missing")
         return None
     columns = {short: f"{c.column}:{c.unit}" for short, c in entry.columns.items()}
-    if "time" in entry.model_fields_set:
+    if entry.time.format != "seconds":
+        frame = gate.csv(path, "loads")
+        if frame is None or (time_s := times_s(frame, entry.time_column, gate.t0, path, "loads", gate.faults)) is None:
+            return None
+    elif "time" in entry.model_fields_set:
         columns["t"] = f"{entry.time.column}:{entry.time.unit}"
-    return None if path is None else LoadsTable(path, entry, columns)
+    return LoadsTable(path, entry, columns, time_s)
 
 
 def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:

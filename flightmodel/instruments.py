@@ -807,8 +807,3 @@ class LoadsEntry(Source, LoadsErrors):
     """
 
     acceleration_at: str | tuple[Place, Place, Place] = "cg"
-
-    def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
-        if self.time.format != "seconds":
-            yield "time", self.time.format, "times of a table of loads are seconds; add a column of seconds after t0"

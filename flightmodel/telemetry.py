@@ -362,12 +362,14 @@ class Motion:
 class LoadsTable:
     """Table of another team's trajectory, as it lies there; `postflight.loads_table` makes loads of it.
 
-    ``columns`` are names of columns, with a unit behind a colon, of those quantities that the header leaves open.
+    ``columns`` are names of columns, with a unit behind a colon, of those quantities that the header leaves open;
+    ``time_s`` (n,) are times that are written as clock times.
     """
 
     path: Path
     stated: LoadsEntry
     columns: dict[str, str]
+    time_s: FloatArray | None = None
 
 
 @dataclass(frozen=True)

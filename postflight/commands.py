@@ -623,9 +623,9 @@ def _print_alone(answers: Deflections, flight: Flight, path: Path, strict: bool 
     print_answers(answers)
     if "camera" in answers.histories:
         console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
-    if telemetry.loads is not None:
-        loads, unused = flight.loads_and_unused
-        sizes = ", ".join(f"{key} = {size:g}" for key, size in telemetry.assumed.get("loads", {}).items())
+    if telemetry.loads is not None and flight.read_loads is not None:
+        loads, unused, _ = flight.read_loads
+        sizes = ", ".join(f"{key} = {size:g}" for key, size in flight.assumed.get("loads", {}).items())
         console.print(
             f"{len(loads.time_s)} rows of {telemetry.loads.path}; errors not stated: {sizes or 'none'}", markup=False
         )

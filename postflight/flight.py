@@ -30,6 +30,7 @@ from recon.settings import Settings
 
 if TYPE_CHECKING:
     from estimators.loads import FlightLoads
+    from postflight.loads_table import ReadLoads
 
 READ = "pf.read_flight(folder)"
 RECONSTRUCT = "pf.reconstruct(flight)"
@@ -89,16 +90,27 @@ class Flight(Tabular):
     @property
     def loads(self) -> FlightLoads | None:
         """Loads of the table that ``[loads]`` names, with the vehicle as assumed; None for a flight without one."""
-        return None if self.telemetry.loads is None else self.loads_and_unused[0]
+        return None if self.read_loads is None else self.read_loads.loads
 
     @cached_property
-    def loads_and_unused(self) -> tuple[FlightLoads, list[str]]:
-        """Loads of the table that flight.toml names, and its columns that are not used."""
-        from postflight.loads_table import loads_and_unused
+    def read_loads(self) -> ReadLoads | None:
+        """The table that ``[loads]`` names, as it was read; None for a flight without one."""
+        from postflight.loads_table import read_table_of_loads
 
         table = self.telemetry.loads
-        assert table is not None
-        return loads_and_unused(table.path, self.telemetry.required_vehicle(), table.columns, table.stated)
+        if table is None:
+            return None
+        vehicle = self.telemetry.required_vehicle()
+        return read_table_of_loads(table.path, vehicle, table.columns, table.stated, table.time_s)
+
+    @property
+    def assumed(self) -> dict[str, dict[str, float]]:
+        """Standard deviations that neither flight.toml nor a column of the table of loads states, by table and key."""
+        known = set() if self.read_loads is None else self.read_loads.stated
+        return {
+            table: {key: sd for key, sd in sizes.items() if table != "loads" or key not in known}
+            for table, sizes in self.telemetry.assumed.items()
+        }
 
     def with_(self, **changes: Any) -> Flight:
         """Return a flight in which these assumptions differ.

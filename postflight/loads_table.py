@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -40,6 +40,11 @@ LOADS_COLUMNS = (
     "t_s", *OWN_COLUMNS.values(), "mach", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", "airspeed_mps", "alt_m",
     "alpha_total_wind_deg", "alpha_total_wind_sd_deg", "clock_lv_deg",
 )  # fmt: skip
+# errors that columns state, and the keys that they take the place of
+_OWN_ERRORS = {
+    "flow_sd_rad": "flow_angle_sd_deg", "dynamic_pressure_sd_pa": "dynamic_pressure_sd_percent",
+    "wind_sd_mps": "wind_sd_mps",
+}  # fmt: skip
 # a day's temperature departs from the standard by a fifth at the most, in the mesosphere; the root of that
 _SOUND_OFF = 0.12
 _DENSITY_FACTOR, _STANDARD_HOLDS_M = 2.0, 80e3  # far beyond what a day's density departs from the standard's below
@@ -87,18 +92,28 @@ def read_loads(
     """
     entry = parse_section(LoadsEntry, {"file": "", "acceleration_at": acceleration_at, **errors}, "read_loads")
     made = vehicle if isinstance(vehicle, Vehicle) else read_vehicle(vehicle)
-    return loads_and_unused(table, made, columns or {}, entry)[0]
+    return read_table_of_loads(table, made, columns or {}, entry).loads
 
 
-def loads_and_unused(
-    table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: Mapping[str, str], entry: LoadsEntry
-) -> tuple[FlightLoads, list[str]]:
-    """Loads, and the names of the table's columns that were not used."""
+class ReadLoads(NamedTuple):
+    """Loads, the table's columns that are not used, and keys of `LoadsErrors` whose errors columns of it state."""
+
+    loads: FlightLoads
+    unused: list[str]
+    stated: set[str]
+
+
+def read_table_of_loads(
+    table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: Mapping[str, str], entry: LoadsEntry,
+    time_s: FloatArray | None = None,
+) -> ReadLoads:  # fmt: skip
+    """Loads by what flight.toml or a command states of a table; ``time_s`` (n,) are clock times that it has."""
     arm_m = _cg_from_sensor(vehicle, entry.acceleration_at)
-    found = find_columns(_as_table(table), dict(columns))
-    loads = loads_from_arrays(vehicle, _columns(found, entry), entry, arm_m)
+    found = find_columns(_as_table(table), dict(columns), time_s)
+    made = _columns(found, entry)
+    loads = loads_from_arrays(vehicle, made, entry, arm_m)
     _check(found.table.label, loads)
-    return loads, found.unused
+    return ReadLoads(loads, found.unused, {key for name, key in _OWN_ERRORS.items() if getattr(made, name) is not None})
 
 
 def _as_table(table: str | Path | pd.DataFrame) -> FreeFormTable:

@@ -154,8 +154,8 @@ def check_folder(folder: Path) -> Report:
     gate = found.gate
     if gate.config or gate.faults:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
-    report.facts = _facts(found) + _loads(report, found)
     report.assumed = assumed_errors(found.spec, found.radars, found.gnss)
+    report.facts = _facts(found) + _loads(report, found)
     report.inputs = Inputs.of(found)
     if found.vehicle is not None and "misalignment" in report.inputs.missing():
         _runs_alone(report, folder, found.vehicle.source)
@@ -228,14 +228,16 @@ def _loads(report: Report, found: Sources) -> list[Fact]:
     """Fact of the table of loads, whose faults are refusals."""
     if found.loads is None or found.vehicle is None:
         return []
-    from postflight.loads_table import loads_and_unused
+    from postflight.loads_table import read_table_of_loads
 
-    entry = found.loads.stated
+    table, entry = found.loads, found.loads.stated
     try:
-        loads, _ = loads_and_unused(found.loads.path, found.vehicle, found.loads.columns, entry)
+        loads, _, stated = read_table_of_loads(table.path, found.vehicle, table.columns, entry, table.time_s)
     except GateError as fault:
         _refuse(report, found.gate.folder, [*report.refused, *fault.faults], report.exit_code or fault.exit_code)
         return []
+    left = {key: sd for key, sd in report.assumed.pop("loads", {}).items() if key not in stated}
+    report.assumed |= {"loads": left} if left else {}
     t = loads.time_s
     return [Fact("loads", entry.file, len(t), float(t[0]), float(t[-1]), float(1.0 / np.median(np.diff(t))), 0)]
 

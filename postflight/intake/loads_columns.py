@@ -75,6 +75,7 @@ class FoundColumns:
     found: dict[str, ColumnProposal] = field(default_factory=dict)
     faults: list[Issue] = field(default_factory=list)
     unused: list[str] = field(default_factory=list)
+    time_s: FloatArray | None = None  # where they were read from clock times
 
     def leave_open(self, short: str, words: str, code: str, column: str = "NAME") -> None:
         """Keep what is wrong with a quantity's column, and how to state it."""
@@ -91,12 +92,13 @@ class FoundColumns:
     def values(self) -> dict[str, FloatArray]:
         """Columns (n,) in SI units."""
         at = self.table.names.index
-        return {short: to_si(self.table.numbers(at(m.column)).copy(), m.unit) for short, m in self.found.items()}
+        read = {short: to_si(self.table.numbers(at(m.column)).copy(), m.unit) for short, m in self.found.items()}
+        return read if self.time_s is None else read | {"t": self.time_s.copy()}
 
     @property
     def missing(self) -> list[str]:
         """Quantities without a column that loads cannot be made without."""
-        there = set(self.found)
+        there = set(self.found) | (set() if self.time_s is None else {"t"})
         if there >= set(MOTION):
             there.add("airspeed")
         out = [name for name in ("t", *FORCE, *RATES, "altitude") if name not in there]
@@ -115,14 +117,20 @@ def kind_of(short: str) -> str:
     return kinds.get(base, "speed")
 
 
-def find_columns(table: FreeFormTable, chosen: dict[str, str]) -> FoundColumns:
-    """Every quantity that the table holds; ``chosen`` are columns that are stated, with units behind a colon."""
-    out, recogniser = FoundColumns(table), Recogniser(table)
+def find_columns(table: FreeFormTable, chosen: dict[str, str], time_s: FloatArray | None = None) -> FoundColumns:
+    """Every quantity that the table holds; ``chosen`` are columns that are stated, with units behind a colon.
+
+    ``time_s`` (n,) are its times where they are known.
+    """
+    out, recogniser = FoundColumns(table, time_s=time_s), Recogniser(table)
     known = {"t", *FORCE, *RATES, "wind_sd", *_SCALARS, *(f"{name}_sd" for name in _WITH_SD)}
     for short in sorted(set(chosen) - known):
         words = f"columns: no quantity '{short}'{nearest_name(short, known)}; known: {', '.join(sorted(known))}"
         out.faults.append(Issue(f"{table.label}: {words}", "key-unknown"))
-    if "t" not in chosen:
+    if time_s is not None and len(time_s) != len(table.rows):
+        words = f"{len(table.rows)} rows and {len(time_s)} times; plain CSV is wanted, as postflight import writes it"
+        out.faults.append(Issue(f"{table.label}: {words}", "time-format"))
+    if "t" not in chosen and time_s is None:
         _find_time(recogniser, out)
     stated = {short: name for short, name in OWN_COLUMNS.items() if name in table.names} | chosen
     for short in known & set(stated):

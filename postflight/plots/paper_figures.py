@@ -192,7 +192,7 @@ def frames_with_camera(
     from estimators.virtual_camera import deformation_of
 
     height, width = np.shape(frames[0])[:2]
-    figure = Figure(figsize=(6.0 * len(frames), 6.0 * height / width + 0.8))
+    figure = Figure(figsize=(6.0 * len(frames), 6.0 * height / width + 0.65))
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
     view, overlay = oriented.view, Overlay(oriented.view, meshes or {})
     for k, ax in enumerate(axes):

@@ -103,10 +103,10 @@ def write_deflection_report(answers: Deflections, flight: Flight, folder: Path, 
     frames, (findings, checks, extra) = _film(run)[0], _listed(run)
     panels = [panel for panel in (deflection_panel(run), *flow_panels(answers)) if panel is not None]
     span = [round(float(t), 3) for t in (run.table["t_s"].iloc[0], run.table["t_s"].iloc[-1])]
-    loads, notes = flight.telemetry.loads, []
-    if loads is not None:
-        unused = flight.loads_and_unused[1]
-        notes = [f"Loads are those of {loads.path.name}. Columns that are not used: {', '.join(unused) or 'none'}."]
+    table, read, notes = flight.telemetry.loads, flight.read_loads, []
+    if table is not None and read is not None:
+        unused = ", ".join(read.unused)
+        notes = [f"Loads are those of {table.path.name}. Columns that are not used: {unused or 'none'}."]
     found = {
         "title": text.title(run),
         "lead": text.lead(run),
@@ -122,7 +122,7 @@ def write_deflection_report(answers: Deflections, flight: Flight, folder: Path, 
         "extra": extra,
     }
     shown = [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames]
-    data = charts(run, span, span, panels, frames=shown)
+    data = charts(run, span, pulse_window(run.table), panels, frames=shown)
     write_whole(folder / _NAME, rendered("deflection.html", data, run=run, **found))
 
 
@@ -135,10 +135,11 @@ def _answer_columns(answers: Deflections) -> pd.DataFrame:
 
 def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[str, Any]) -> Run:
     """Answers with the tables of their folder, in the form that the parts of the report read."""
-    telemetry, checks, at_s = flight.telemetry, answers.consistency_checks, answers.reference_s
+    telemetry, checks = flight.telemetry, answers.consistency_checks
     tables = {path.stem: read_csv(path) for path in sorted(folder.glob("*.csv"))}
-    times = [history.time_s for history in answers.histories.values()] or [np.zeros(2)]
-    tables["bet"] = pd.DataFrame({"t_s": np.unique(np.concatenate(times))})
+    times = [*(h.time_s for h in answers.histories.values()), *(film.time_s for film in telemetry.films.values())]
+    tables["bet"] = pd.DataFrame({"t_s": np.unique(np.concatenate(times or [np.zeros(1)]))})
+    at_s = answers.reference_s if np.isfinite(answers.reference_s) else float(tables["bet"]["t_s"][0])
     tables["peaks"] = pd.DataFrame({"peak": [], "value": [], "sd": [], "inside": []})
     tables["events"] = pd.DataFrame({"t_s": [], "event": []})
     tables["findings"] = pd.DataFrame([f.as_row() for f in telemetry.findings], columns=["source", "what", "code"])
@@ -158,7 +159,7 @@ def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[s
         summary["peak_dynamic_pressure_pa"] = at.pop("dynamic_pressure_pa")
         tables["events"] = pd.DataFrame([{"event": "peak dynamic pressure"} | at])
     facts = {"settings": settings, "version": version("postflight"), "inputs_sha256": telemetry.hashes}
-    header = {"epoch_utc": telemetry.t0_utc, "assumed": telemetry.assumed}
+    header = {"epoch_utc": telemetry.t0_utc, "assumed": flight.assumed}
     return Run(folder, summary, facts, header, tables, flight)
 
 

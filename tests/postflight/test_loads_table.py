@@ -281,3 +281,35 @@ def test_loads_beside_trackers_are_refused_and_proposed_as_a_comment(folder, run
 def test_columns_of_no_known_quantity_are_refused(alien):
     with refuses("key-unknown", names=["altitude"]):
         read_loads(alien, "irve2_reference", columns={"altitud": "ALT (kft)"})
+
+
+def test_clock_times_count_from_the_flights_time_zero(folder):
+    path = folder / "flight.toml"
+    table = folder / tomllib.loads(path.read_text())["loads"]["file"]
+    flown = pd.read_csv(table)
+    direct = pf.read_flight(folder).loads
+    clock = pd.Timestamp("2009-08-17T12:52:00") + pd.to_timedelta(flown.pop("MET (ms)"), unit="ms")
+    flown.insert(0, "GMT", clock.dt.strftime("%j:%H:%M:%S.%f"))
+    flown.to_csv(table, index=False)
+    time = 'time = { column = "GMT", format = "irig_doy", offset_s = 2.0 }'
+    path.write_text(re.sub(r"(?m)^time = \{.*$", time, path.read_text()))
+    loads = pf.read_flight(folder).loads
+    assert abs(loads.time_s[0] - 2.0 - direct.time_s[0]) < 0.051  # on a grid of 20 Hz
+    assert loads.dynamic_pressure_pa.max() == pytest.approx(direct.dynamic_pressure_pa.max(), rel=1e-4)
+    table.write_text(table.read_text().replace(":12:59:", ":12.59.", 1))
+    with refuses("time-format"):
+        pf.read_flight(folder)
+
+
+def test_errors_that_the_table_states_are_not_assumed(folder, run, bet):
+    own = folder / "telemetry" / "own.csv"
+    shutil.copy(run / "bet.csv", own)
+    text = (folder / "flight.toml").read_text()
+    stated = '[loads]\nfile = "telemetry/own.csv"\nuse_s = [[420.0, 450.0]]\nrate_scale_sd = 0.001\n'
+    (folder / "flight.toml").write_text(text[: text.index("\n[loads]")] + f"\n{stated}")
+    flight = pf.read_flight(folder)
+    assert not {"flow_angle_sd_deg", "dynamic_pressure_sd_percent", "rate_scale_sd"} & set(flight.assumed["loads"])
+    assert "time_bias_sd_s" in flight.assumed["loads"]
+    assert flight.loads.time_s[0] >= 420.0
+    assert flight.loads.time_s[-1] <= 450.0
+    assert pf.check_flight(folder).assumed["loads"] == flight.assumed["loads"]
