@@ -180,16 +180,14 @@ def flow_panels(answers: Deflections) -> list[Panel]:
         return []
     flow = flow_of("report", answers)
     rows = kept_rows([flow.alpha_total_wind_rad, flow.dynamic_pressure_pa], _TRAJECTORY_ROWS // 2)
-    t, (alpha, sd) = (
-        rounded(flow.time_s[rows], 4),
-        np.rad2deg([flow.alpha_total_wind_rad, flow.alpha_total_wind_sd_rad]),
-    )
-    angle = line_of("wind-relative", alpha[rows], sd[rows], _BLUE, [], 3) | {"t": t}
+    t = rounded(flow.time_s[rows], 4)
     pressure = line_of("dynamic pressure", flow.dynamic_pressure_pa[rows], None, _BLUE, [], 3) | {"t": t}
-    return [
-        panel_of("alpha", "Total angle of attack of the centerbody", "deg", None, [angle], []),
-        panel_of("pressure", "Dynamic pressure", "Pa", None, [pressure], []),
-    ]
+    out = [panel_of("pressure", "Dynamic pressure", "Pa", None, [pressure], [])]
+    alpha, sd = np.rad2deg([flow.alpha_total_wind_rad[rows], flow.alpha_total_wind_sd_rad[rows]])
+    if np.isfinite(alpha).any():
+        angle = line_of("wind-relative", alpha, sd, _BLUE, [], 3) | {"t": t}
+        out.insert(0, panel_of("alpha", "Total angle of attack of the centerbody", "deg", None, [angle], []))
+    return out
 
 
 def drawn_answer(table: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -24,6 +24,7 @@ from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
 from flightmodel.config import parse_utc
+from flightmodel.events import has_peak
 from flightmodel.files import write_file, writing
 from postflight.deflections import Deflections
 from postflight.flight import Flight
@@ -155,9 +156,11 @@ def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[s
         assert air is not None
         columns = {"t_s": air.time_s, "alt_m": air.altitude_m, "mach": air.mach}
         tables["bet"] = pd.DataFrame(columns | {"dynamic_pressure_pa": air.dynamic_pressure_pa})
-        at = {name: float(np.interp(at_s, air.time_s, column)) for name, column in tables["bet"].items()}
-        summary["peak_dynamic_pressure_pa"] = at.pop("dynamic_pressure_pa")
+        columns |= {"value": air.dynamic_pressure_pa, "sd": air.dynamic_pressure_sd_pa}
+        at = {name: float(np.interp(at_s, air.time_s, column)) for name, column in columns.items()}
+        summary["peak_dynamic_pressure_pa"] = at["value"]
         tables["events"] = pd.DataFrame([{"event": "peak dynamic pressure"} | at])
+        tables["peaks"] = pd.DataFrame([{"peak": "dynamic pressure", "inside": has_peak(air.dynamic_pressure_pa)} | at])
     facts = {"settings": settings, "version": version("postflight"), "inputs_sha256": telemetry.hashes}
     header = {"epoch_utc": telemetry.t0_utc, "assumed": flight.assumed}
     return Run(folder, summary, facts, header, tables, flight)

@@ -313,3 +313,12 @@ def test_errors_that_the_table_states_are_not_assumed(folder, run, bet):
     assert flight.loads.time_s[0] >= 420.0
     assert flight.loads.time_s[-1] <= 450.0
     assert pf.check_flight(folder).assumed["loads"] == flight.assumed["loads"]
+
+
+def test_the_report_of_a_table_that_ends_before_the_peak_says_so(alien, bet, tmp_path, command):
+    alien[(bet.dynamic_pressure_pa < 900.0) & (bet.t_s < bet.t_s[bet.dynamic_pressure_pa.idxmax()])].to_csv(
+        tmp_path / "rise.csv", index=False
+    )
+    assert command("deflection", "--loads", tmp_path / "rise.csv", "--vehicle", "irve2_reference").returncode == 0
+    page = (tmp_path / "rise-deflection" / "report.html").read_text()
+    assert "the largest q in the data" in page
