@@ -2,8 +2,8 @@
 
 Run: ``python benchmarks/loads_coverage.py [FLIGHTS [FIRST SEED]]`` (40 flights from seed 0; a second a flight).
 Vehicles, joints, c.g. offsets, spins and coefficients are drawn as `tests.wide_flights` says, soft joints alone:
-deflections of 2 to 20 deg. The table has what flew with the errors of `estimators.loads.LoadsErrors`, drawn once a
-flight: accelerometer and gyros by bias, scale and mounting, the air by a wind and a factor of dynamic pressure, the
+deflections of 2 to 20 deg. The table has what flew with the errors of `flightmodel.instruments.LoadsErrors`, drawn once
+a flight: accelerometer and gyros by bias, scale and mounting, the air by a wind and a factor of dynamic pressure, the
 flow angle half fixed in the body and half in inertial space, as an attitude errs. The estimators get the table and the
 stated vehicle alone.
 """
@@ -18,10 +18,10 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import postflight as pf
-from estimators.loads import LoadsErrors
 from flightmodel import rotations
 from flightmodel.airdata import air_data
 from flightmodel.checks import GateError
+from flightmodel.instruments import LoadsErrors
 from flightmodel.trajectory import resample
 from synthetic_flight.scenarios import fly_scenario
 from tests import wide_flights

@@ -19,8 +19,8 @@ import numpy as np
 from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import BoolArray, FloatArray, GateError, check_finite, check_increasing, check_shape
-from flightmodel.config import ErrorAngle, NonNegative, Section
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
+from flightmodel.instruments import LoadsErrors
 from flightmodel.vehicle import Vehicle
 
 # below this axial deceleration the ratio of forces and the moment balance carry no information
@@ -160,27 +160,6 @@ def pitching_radps(vehicle: Vehicle, mach: float, dynamic_pressure_pa: float, sp
     inertia = 0.5 * (vehicle.inertia[1, 1] + vehicle.inertia[2, 2])
     square = dynamic_pressure_pa * vehicle.reference.area_m2 * restoring_m / inertia
     return float(np.sqrt(max(square, 0.0)) + abs(spin_radps))
-
-
-class LoadsErrors(Section):
-    """Standard deviations of what a table of loads does not state; each widens the answer.
-
-    The defaults are those of a good entry instrumentation: an accelerometer of 5 mg, gyros of 0.05 deg/s, a flow angle
-    known to 0.3 deg beside the wind, winds of a sounding of the day, a dynamic pressure known to 3 %. Noises that are
-    not stated are measured.
-    """
-
-    accelerometer_noise_sd_mps2: NonNegative | None = None
-    accelerometer_bias_sd_mps2: NonNegative = 0.05
-    accelerometer_scale_sd: NonNegative = 0.002
-    accelerometer_mount_sd_deg: ErrorAngle = 0.1
-    rate_noise_sd_degps: NonNegative | None = None
-    rate_bias_sd_degps: NonNegative = 0.05
-    rate_scale_sd: NonNegative = 0.002
-    flow_angle_sd_deg: ErrorAngle = 0.3
-    wind_sd_mps: NonNegative = 3.0
-    dynamic_pressure_sd_percent: NonNegative = 3.0
-    time_bias_sd_s: NonNegative = 0.001
 
 
 @dataclass(frozen=True)

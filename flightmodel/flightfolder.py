@@ -44,7 +44,7 @@ from flightmodel.earth import (
     q_ecef_body_from_pointing,
 )
 from flightmodel.entry_state import DragEntry, StateEntry, read_drag, refuse_misread_entry
-from flightmodel.files import open_file
+from flightmodel.files import nothing_at, open_file
 from flightmodel.film import Frames
 from flightmodel.gate import Gate
 from flightmodel.input_findings import input_findings
@@ -54,6 +54,7 @@ from flightmodel.instruments import (
     BarometerEntry,
     FramesEntry,
     GnssEntry,
+    LoadsEntry,
     MagnetometerEntry,
     RadarEntry,
     RatesEntry,
@@ -72,12 +73,13 @@ from flightmodel.sensor_tables import (
     read_triad,
     with_least_count,
 )
-from flightmodel.tables import GNSS_SD, Source, Spans
+from flightmodel.tables import GNSS_SD, Source, Spans, times_s
 from flightmodel.telemetry import (
     AttitudePrior,
     BarometerRecord,
     GnssRecord,
     KnownPlace,
+    LoadsTable,
     Motion,
     RadarRecord,
     Sounding,
@@ -247,6 +249,7 @@ class FlightFile(Section):
     places: list[PlaceEntry] = []
     gnss: dict[Name, GnssEntry] = {}
     barometers: dict[Name, BarometerEntry] = {}
+    loads: LoadsEntry | None = None
     atmosphere: AtmosphereEntry | None = None
     frames: FramesEntry | None = None
     cameras: dict[Name, FramesEntry] = {}
@@ -305,23 +308,30 @@ class FlightFile(Section):
         """Every table that is named."""
         onboard = (self.sensors.accelerometer, self.sensors.rates, self.sensors.magnetometer, self.sensors.sun)
         drag = None if self.drag is None else self.drag.table
-        single = [s for s in (*onboard, self.atmosphere, drag) if s is not None]
+        single = [s for s in (*onboard, self.atmosphere, drag, self.loads) if s is not None]
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
     def misfits(self, needs_path: bool = True) -> Iterator[Issue]:
         """Yield what does not go together, each with what to write instead.
 
-        Without ``needs_path`` a folder with a film and neither radar nor receiver is whole.
+        Without ``needs_path`` a folder with a film and neither radar nor receiver is whole, and one with loads always.
         """
         yield from self._misfits_of_planet()
+        measures_path = bool(self.radars or self.gnss or self.start.state)
+        if self.loads is not None and (measures_path or self.sensors.triads):
+            words = "[loads] is another team's trajectory, and beside it stands what one is reconstructed from"
+            also = "take [loads] out, or [radars.NAME], [gnss.NAME], [start.state] and [sensors]"
+            yield Issue(f"{words}; {also}", "keys-conflict")
         if self.drag is not None and self.vehicle is not None:
             words = "[drag] beside vehicle: the vehicle file states C_A, area and mass; take one of the two out"
             yield Issue(words, "keys-conflict")
-        if needs_path or self.radars or self.gnss or not self.films:
+        if self.loads is None and (needs_path or self.radars or self.gnss or not self.films):
             yield from self._misfits_of_path()
         if self.films and self.vehicle is None:
             tables = ", ".join(self.films)
             yield Issue(f'{tables}: their camera stands in a vehicle file; add vehicle = "..."', "vehicle-missing")
+        if self.loads is not None and self.vehicle is None:
+            yield Issue('[loads]: mass and coefficients are wanted; add vehicle = "..."', "vehicle-missing")
         if self.frames is not None and self.cameras:
             words = "[frames] beside [cameras.NAME]: one camera stands in [frames], several in [cameras.NAME] each"
             yield Issue(words, "keys-conflict")
@@ -426,6 +436,7 @@ class Sources:
     attitude_prior: AttitudePrior | None
     drag: StatedDrag | None = None
     state: StatePrior | None = None
+    loads: LoadsTable | None = None
 
 
 def read_sources(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Sources:
@@ -483,9 +494,11 @@ def read_sources(folder: Path, progress: Callable[[float], None] | None = None, 
     if spec.motion.model == "strapdown":
         most_g = {name: entry.most_g for name, entry in spec.gnss.items()}
         gate.findings.extend(input_findings(triads.get("accelerometer"), gnss, prior, most_g))
+    loads = _loads(gate, spec.loads) if spec.loads is not None else None
     return Sources(
-        gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior, drag, state
-    )
+        gate, spec, vehicle, _there(triads), sun, radars, gnss, _there(barometers), sounding, films, prior, drag, state,
+        loads,
+    )  # fmt: skip
 
 
 def read_flight(folder: Path, progress: Callable[[float], None] | None = None, needs_path: bool = True) -> Telemetry:
@@ -521,6 +534,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
         assumed=assumed_errors(spec, found.radars, found.gnss),
         drag=found.drag,
         planet=spec.body,
+        loads=found.loads,
         gnss=found.gnss,
         barometers=found.barometers,
         motion=_motion(spec, found.drag),
@@ -591,6 +605,24 @@ def _films(gate: Gate, spec: FlightFile, vehicle: Vehicle | None) -> dict[str, F
     return _there(read)
 
 
+def _loads(gate: Gate, entry: LoadsEntry) -> LoadsTable | None:
+    """Table of loads where it lies; None, with a fault kept, where there is none that may be read."""
+    path, time_s = gate.path(entry.file), None
+    if path is None:
+        return None
+    if not path.is_file():
+        gate.refuse(f"loads: {path}: {nothing_at(path)}", "file-missing")
+        return None
+    columns = {short: f"{c.column}:{c.unit}" for short, c in entry.columns.items()}
+    if entry.time.format != "seconds":
+        frame = gate.csv(path, "loads")
+        if frame is None or (time_s := times_s(frame, entry.time_column, gate.t0, path, "loads", gate.faults)) is None:
+            return None
+    elif "time" in entry.model_fields_set:
+        columns["t"] = f"{entry.time.column}:{entry.time.unit}"
+    return LoadsTable(path, entry, columns, time_s)
+
+
 def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
     """Read the day's air; the standard's, with a finding, where flight.toml names no table."""
     if spec.atmosphere is not None:
@@ -599,6 +631,8 @@ def _sounding(gate: Gate, spec: FlightFile) -> Sounding | None:
         words = f"no [atmosphere]: the standard atmosphere of {spec.planet.capitalize()} without wind stands for it"
         gate.findings.append(Issue(words, "no-sounding", "atmosphere"))
         return standard_sounding(spec.body)
+    if spec.loads is not None:  # it states the air itself
+        return standard_sounding()
     words = (
         "no [atmosphere]: the US Standard Atmosphere 1976 stands for it, density to 10 % (24 % from 80 km), "
         "wind to 15 m/s"
@@ -740,23 +774,26 @@ def assumed_errors(
     """
     entries: dict[str, Section | None] = {f"barometers.{name}": entry for name, entry in spec.barometers.items()}
     entries |= {f"sensors.{name}": getattr(spec.sensors, name) for name in type(spec.sensors).model_fields}
-    out = {table: _assumed_of(entry, set()) for table, entry in entries.items() if entry is not None}
+    out = {table: assumed_of(entry) for table, entry in entries.items() if entry is not None}
     for name, receiver in spec.gnss.items():
-        out[f"gnss.{name}"] = _assumed_of(receiver, _not_in_the_fixes(gnss[name]) if name in gnss else set())
+        out[f"gnss.{name}"] = assumed_of(receiver, _not_in_the_fixes(gnss[name]) if name in gnss else set())
     for name, radar in spec.radars.items():
-        out[f"radars.{name}"] = _assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
+        out[f"radars.{name}"] = assumed_of(radar, _not_measured_or_in_the_table(radar, radars.get(name)))
     if spec.measures_deceleration and "trim_sd_deg" not in spec.motion.model_fields_set:
         out["motion"] = {"trim_sd_deg": spec.motion.trim_sd_deg}
+    if spec.loads is not None:
+        out["loads"] = assumed_of(spec.loads)
     if spec.start.state is not None:
-        out["start.state"] = _assumed_of(spec.start.state, set())
+        out["start.state"] = assumed_of(spec.start.state)
     prior = spec.attitude_prior
     if prior is not None and "sd_deg" not in prior.model_fields_set:
         out["attitude_prior"] = {"sd_deg": float(prior.sd_deg[0])}
     return {table: keys for table, keys in out.items() if keys}
 
 
-def _assumed_of(entry: Section, known: set[str]) -> dict[str, float]:
-    stated = known | entry.model_fields_set
+def assumed_of(entry: Section, known: Iterable[str] = ()) -> dict[str, float]:
+    """Standard deviations by default of what a table does not state, but for those that are ``known`` otherwise."""
+    stated = {*known, *entry.model_fields_set}
     defaults = {key: field.default for key, field in type(entry).model_fields.items() if _SD.search(key)}
     return {key: float(sd) for key, sd in defaults.items() if key not in stated and isinstance(sd, float) and sd > 0.0}
 

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, create_model
 
 from flightmodel.checks import FloatArray, Issue
-from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFault, Place, Section
+from flightmodel.config import Angle, Duration, ErrorAngle, Fraction, KeyFault, NonNegative, Place, Section
 from flightmodel.earth import undulation_m
 from flightmodel.tables import Declared, Source, Thinning
 
@@ -776,3 +776,34 @@ class FramesEntry(Source):
     camera: str = "camera5"
     benchmark_s: float = 421.0
     time_bias_sd_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+
+class LoadsErrors(Section):
+    """Standard deviations of what a table of loads does not state; each widens the answer.
+
+    The defaults are those of a good entry instrumentation: an accelerometer of 5 mg, gyros of 0.05 deg/s, a flow angle
+    known to 0.3 deg beside the wind, winds of a sounding of the day, a dynamic pressure known to 3 %. Noises that are
+    not stated are measured.
+    """
+
+    accelerometer_noise_sd_mps2: NonNegative | None = None
+    accelerometer_bias_sd_mps2: NonNegative = 0.05
+    accelerometer_scale_sd: NonNegative = 0.002
+    accelerometer_mount_sd_deg: ErrorAngle = 0.1
+    rate_noise_sd_degps: NonNegative | None = None
+    rate_bias_sd_degps: NonNegative = 0.05
+    rate_scale_sd: NonNegative = 0.002
+    flow_angle_sd_deg: ErrorAngle = 0.3
+    wind_sd_mps: NonNegative = 3.0
+    dynamic_pressure_sd_percent: NonNegative = 3.0
+    time_bias_sd_s: NonNegative = 0.001
+
+
+class LoadsEntry(Source, LoadsErrors):
+    """Table of another team's trajectory: its file, columns, errors, and where its accelerometer is.
+
+    ``acceleration_at`` is ``"cg"``, a package of the vehicle file, or a place from the datum in body axes, m. Columns
+    that the header leaves no doubt about need not be named.
+    """
+
+    acceleration_at: str | tuple[Place, Place, Place] = "cg"

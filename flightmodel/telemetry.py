@@ -10,13 +10,23 @@ about the size of gravity: in free fall there is none, under a parachute it shak
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
 from flightmodel.checks import FloatArray, GateError, Issue, check_increasing, check_shape
 from flightmodel.earth import WGS84, Planet
-from flightmodel.instruments import BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, SitesSpec, SunHeads, TriadSpec
+from flightmodel.instruments import (
+    BarometerSpec,
+    GnssSpec,
+    InstrumentSpec,
+    LoadsEntry,
+    RadarSite,
+    SitesSpec,
+    SunHeads,
+    TriadSpec,
+)
 from flightmodel.tables import ThinnedSpan
 from flightmodel.vehicle import Vehicle
 
@@ -349,11 +359,26 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class LoadsTable:
+    """Table of another team's trajectory, as it lies there; `postflight.loads_table` makes loads of it.
+
+    ``columns`` are names of columns, with a unit behind a colon, of those quantities that the header leaves open;
+    ``time_s`` (n,) are times that are written as clock times.
+    """
+
+    path: Path
+    stated: LoadsEntry
+    columns: dict[str, str]
+    time_s: FloatArray | None = None
+
+
+@dataclass(frozen=True)
 class Telemetry:
     """Everything measured on one flight, plus what the analyst states about vehicle, start and motion.
 
     Rates are not there without an accelerometer; an accelerometer alone measures the deceleration of ballistic flight.
-    At least one radar or receiver is there, but where the film alone is looked at or ``start`` gives a state.
+    At least one radar or receiver is there, but where ``start`` gives a state, or the film or another team's ``loads``
+    are looked at alone.
     """
 
     name: str
@@ -381,6 +406,7 @@ class Telemetry:
     assumed: dict[str, dict[str, float]] = field(default_factory=dict)  # sds that no file states, by table and key
     drag: StatedDrag | None = None  # without a vehicle file
     planet: Planet = WGS84
+    loads: LoadsTable | None = None
 
     @property
     def frames(self) -> Frames | None:

@@ -329,12 +329,12 @@ def reconstruct(folder: Path, sensitivity: bool, changed: WhatIfs) -> None:
 @click.option("--loads", metavar="TABLE", help="Instead of FOLDER: another team's trajectory, accelerations and rates.")
 @click.option("--vehicle", metavar="FILE", help="Vehicle file, or the name of a shipped one, for --loads and --film.")
 @click.option("--column", "columns", multiple=True, metavar="NAME=COLUMN[:UNIT]", help="Of --loads: ax='AX (g)'.")
-@click.option("--set", "errors", multiple=True, metavar="KEY=VALUE", help="Of --loads: flow_angle_sd_deg=0.5, ...")
+@click.option("--set", "settings", multiple=True, metavar="NAME=VALUE", help="As of run; of loads: wind_sd_mps=1.")
 @click.option("--at", "place", default="cg", help="Of --loads: where the accelerometer is: cg, or a vehicle's package.")
 def deflection(
     folder: Path | None, methods: tuple[str, ...], plane: float | None, joint: float | None, film: str | None,
     times: str | None, camera: str | None, benchmark: float | None,
-    loads: str | None, vehicle: str | None, columns: tuple[str, ...], errors: tuple[str, ...], place: str,
+    loads: str | None, vehicle: str | None, columns: tuple[str, ...], settings: tuple[str, ...], place: str,
 ) -> None:  # fmt: skip
     """Estimate how far the aeroshell deflected: in the flight in FOLDER, by a table of loads (--loads, --vehicle), or
     by a film alone (--film, --times, --vehicle).
@@ -342,16 +342,17 @@ def deflection(
     from postflight import commands
 
     alone = None if film == OVERLAY else film
-    stated = [folder, loads, alone].count(None) == 2 and (folder is not None or vehicle is not None)
-    if not stated or (alone is not None and times is None):
+    whole = [folder, loads, alone].count(None) == 2 and (folder is not None or vehicle is not None)
+    if not whole or (alone is not None and times is None):
         words = "name FOLDER, or --loads TABLE --vehicle FILE, or --film PICTURES --times LIST --vehicle FILE"
         raise click.UsageError(f"{words}; to draw the overlay of a flight's film, write FOLDER --film")
+    stated = commands.asked(settings, (), None).changes
+    changes = stated | commands.assumed(plane, joint)
     if folder is not None:
-        commands.deflection(folder, methods, plane, joint, film == OVERLAY)
+        commands.deflection(folder, methods, commands.Asked(changes), film == OVERLAY)
     elif loads is not None:
-        commands.deflection_of_table(Path(loads), str(vehicle), methods, columns, errors, place)
+        commands.deflection_of_table(Path(loads), str(vehicle), methods, columns, stated, place)
     else:
-        changes = commands.assumed(plane, joint)
         commands.deflection_of_film(Path(str(alone)), str(times), str(vehicle), camera, benchmark, changes)
 
 

@@ -23,17 +23,19 @@ from rich.table import Table
 from flightmodel.camera import Lens
 from flightmodel.checks import NO_FAULT, Check, ConfigError, DivergenceError, FloatArray, GateError, Issue, Progress
 from flightmodel.config import parse_section
+from flightmodel.flightfolder import read_flight_file
+from flightmodel.instruments import LoadsEntry
 from flightmodel.statistics import decimals, pair
 from flightmodel.vehicle import read_vehicle
 from postflight import run_folder, warmup
 from postflight.beside import Beside, Task, same
 from postflight.deflections import METHODS, Deflections, camera_sensitivity, estimate, said, with_increments
-from postflight.flight import Flight, read_flight
-from postflight.methods import NO_VIDEO, Inputs
+from postflight.flight import Flight, flight_of_table, read_flight
+from postflight.methods import BY_LOADS, NO_VIDEO, Inputs
 from postflight.plots.style import FigureFolder
 from postflight.reconstruction import Reconstruction, reconstruct
 from postflight.report.text import rests_on
-from postflight.report.write import write_report
+from postflight.report.write import write_deflection_report, write_report
 from postflight.runs import check_name, find_run
 from postflight.scoring import PUBLISHED_DEG, Limits, Score, score_run
 from postflight.sensitivity import largest_of_groups, sensitivity
@@ -183,6 +185,9 @@ def run(
         if methods:
             print_answers(answers)
 
+    if methods and read_flight_file(folder).loads is not None:  # whose trajectory another team made
+        deflection(folder, (), wanted, formats=formats, strict=strict)
+        return
     _, answers, written = run_flight(folder, methods, wanted, reruns, show_answers, stages, formats)
     print_increments(answers)
     if (written / "sensitivity.csv").is_file():
@@ -513,24 +518,26 @@ def assumed(plane_deg: float | None, joint_m: float | None) -> dict[str, Any]:
 
 
 def deflection(
-    folder: Path, methods: tuple[str, ...], plane_deg: float | None, joint_m: float | None, film: bool = False
-) -> None:
-    """Estimate the deflection alone; the camera needs no trajectory, and is corrected where one can be made."""
+    folder: Path, methods: tuple[str, ...], wanted: Asked, film: bool = False, formats: tuple[str, ...] = (),
+    strict: bool = False,
+) -> None:  # fmt: skip
+    """Estimate the deflection alone; the camera needs no trajectory, and is corrected where one can be made.
+
+    With ``film`` the onboard film is written with the virtual camera over it; ``formats`` and ``strict``: `run`.
+    """
     from postflight.filming import by_camera
     from postflight.plots.overlay import write_overlay_film
-    from postflight.plots.run_figures import draw_camera
 
-    flight = read_flight(folder, needs_path=set(methods) != {"camera"}).with_(**assumed(plane_deg, joint_m))
+    flight = wanted.of(read_flight(folder, needs_path=set(methods) != {"camera"}))
     telemetry = flight.telemetry
     if not methods:
         methods = tuple(m for m in METHODS if m != "camera" or m not in Inputs.of(telemetry).missing())
-    settings = {"methods": list(methods), "plane_deg": plane_deg, "joint_m": joint_m}
-    alone = set(methods) == {"camera"}
-    makes_bet = not alone or (plane_deg is None and telemetry.can_tell_load)
+    settings = {"methods": list(methods), "changes": list(flight.changes)}
+    alone, plane_is_known = set(methods) == {"camera"}, flight.camera_plane_lv_rad is not None
+    makes_bet = telemetry.loads is None and (not alone or (not plane_is_known and telemetry.can_tell_load))
     if makes_bet:
         compile_kernels(*warmup.RECONSTRUCTION)
-    if "camera" in methods:
-        compile_kernels("camera")
+    compile_kernels(*(["camera"] if "camera" in methods else []), *(["balance"] if telemetry.loads else []))
     with progress_bar() as report:
         bet, trouble = None, NO_FAULT
         try:
@@ -541,54 +548,35 @@ def deflection(
                 raise
             trouble = Issue(str(fault), fault.codes[0])
         answers = estimate(bet or flight, methods, lambda f, what: report(0.6 + 0.3 * f, what))
-        with run_folder.RunFolder(folder, telemetry, settings, as_read=flight.as_read) as out:
-            run_folder.write_answers(out, answers)
-            run_folder.write_checks(out, answers.consistency_checks)
-            if "camera" in answers.histories:
-                history = answers.histories["camera"]
-                draw_camera(flight, history, out.path / "figures")
-                if film:
-                    for name in by_camera(telemetry, history):
-                        file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
-                        write_overlay_film(flight, out.path / "figures" / file, history, name, report)
-    for words, code in few_of_each(telemetry.findings):
-        console.coded("[yellow]found[/]", words, code)
+        with run_folder.RunFolder(folder, telemetry, settings, wanted.name, flight.as_read) as out:
+            _write_alone(out, answers, flight, settings, formats)
+            for name in by_camera(telemetry, answers["camera"]) if film and "camera" in answers.histories else ():
+                file = "overlay.webm" if len(telemetry.films) == 1 else f"overlay_{name}.webm"
+                write_overlay_film(flight, out.path / "figures" / file, answers["camera"], name, report)
     if trouble:
         console.coded("[yellow]no trajectory[/],", f"the camera answers alone: {trouble}", trouble.code)
-    print_answers(answers)
-    if "camera" in answers.histories:
-        console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
-    elif film:
+    if film and "camera" not in answers.histories:
         console.coded(
             "[yellow]no film[/]", "was drawn: there is no answer of the camera to lay over it", "figure-failed"
         )
-    console.print(f"results in {escape(str(out.path))}")
-    if answers.refused:
-        sys.exit(EXIT_NO_ANSWER)
+    _print_alone(answers, flight, out.path, strict)
 
 
 def deflection_of_table(
-    table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], errors: tuple[str, ...], place: str
+    table: Path, vehicle: str, methods: tuple[str, ...], columns: tuple[str, ...], changes: dict[str, Any], place: str
 ) -> None:
-    """Estimate by loads, print, and write tables and figures beside them, in ``<stem>-deflection``."""
-    from estimators.loads import LoadsErrors
-    from postflight.loads_table import loads_and_unused
-
+    """Estimate by loads, print, and write tables, figures and report beside them, in ``<stem>-deflection``."""
     pairs = dict(text.partition("=")[::2] for text in columns)
-    changes = asked(errors, (), None).changes
-    made, stated = read_vehicle(vehicle), parse_section(LoadsErrors, changes, "--set")
-    loads, unused = loads_and_unused(table, made, pairs, place, stated)
+    entry = parse_section(LoadsEntry, {"file": table.name, "acceleration_at": place, **changes}, "--set")
+    flight = flight_of_table(table, read_vehicle(vehicle), pairs, entry)
     compile_kernels("balance")
-    answers = estimate(loads, methods or tuple(name for name in METHODS if name != "camera"))
-    defaults = (f"{key} = {size}" for key, size in LoadsErrors().model_dump().items() if key not in changes and size)
-    words = [f"{len(loads.time_s)} rows of {table}; errors not stated there: {', '.join(defaults)}"]
-    _finish_alone(table, answers, [*words, *([f"columns not used: {', '.join(unused)}"] if unused else [])])
+    _finish_alone(table, estimate(flight, methods or BY_LOADS), flight)
 
 
 def deflection_of_film(
     pictures: Path, times: str, vehicle: str, camera: str | None, benchmark_s: float | None, changes: dict[str, Any]
 ) -> None:
-    """Estimate by a film alone, print, and write tables and figures beside it, in ``<stem>-deflection``.
+    """Estimate by a film alone, print, and write tables, figures and report beside it, in ``<stem>-deflection``.
 
     ``times`` is a list of frames, or their rate in Hz; ``changes`` are changes of `Flight.with_`.
     """
@@ -602,27 +590,53 @@ def deflection_of_film(
     compile_kernels("camera")
     with progress_bar() as report:
         answers = estimate(film, ("camera",), report)
-    for words, code in few_of_each(film.findings):
-        console.coded("[yellow]found[/]", words, code)
-    camera_words = [f"camera: {history.assumptions}" for history in answers.histories.values()]
-    _finish_alone(pictures, answers, camera_words, film)
+    _finish_alone(pictures, answers, film)
 
 
-def _finish_alone(given: Path, answers: Deflections, words: list[str], film: Flight | None = None) -> None:
+def _finish_alone(given: Path, answers: Deflections, flight: Flight) -> None:
     """Write answers that no run holds into ``<stem>-deflection`` beside what they were made from, and print them."""
-    from postflight.plots.run_figures import draw_alone
-
     out = run_folder.Results(given.with_name(f"{given.stem}-deflection"))
     (out.path / "figures").mkdir(parents=True, exist_ok=True)
+    _write_alone(out, answers, flight, {"methods": list(answers.histories), "changes": list(flight.changes)})
+    _print_alone(answers, flight, out.path)
+
+
+def _write_alone(
+    out: run_folder.Results, answers: Deflections, flight: Flight, settings: dict[str, Any],
+    formats: tuple[str, ...] = (),
+) -> None:  # fmt: skip
+    """Write tables, figures and report of answers that have no run."""
+    from postflight.plots.run_figures import draw_alone
+
     out.write_csv("answers.csv", answers.to_frame())
     run_folder.write_answers(out, answers)
     run_folder.write_checks(out, answers.consistency_checks)
-    draw_alone(answers, FigureFolder(out.path / "figures"), film)
+    draw_alone(answers, FigureFolder(out.path / "figures", ("png", *formats)), flight)
+    write_deflection_report(answers, flight, out.path, settings)
+
+
+def _print_alone(answers: Deflections, flight: Flight, path: Path, strict: bool = False) -> None:
+    """Print findings, answers and what they rest on; exit 4 where a method has none, 5 in doubt with ``strict``."""
+    telemetry = flight.telemetry
+    for words, code in few_of_each(telemetry.findings):
+        console.coded("[yellow]found[/]", words, code)
     print_answers(answers)
-    for line in (*words, f"results in {out.path}"):
-        console.print(line, markup=False)
+    if "camera" in answers.histories:
+        console.print(f"camera: {escape(answers.histories['camera'].assumptions)}")
+    if telemetry.loads is not None and flight.read_loads is not None:
+        loads, unused, _ = flight.read_loads
+        sizes = ", ".join(f"{key} = {size:g}" for key, size in flight.assumed.get("loads", {}).items())
+        console.print(
+            f"{len(loads.time_s)} rows of {telemetry.loads.path}; errors not stated: {sizes or 'none'}", markup=False
+        )
+        if unused:
+            console.print(f"columns not used: {', '.join(unused)}", markup=False)
+    console.print(f"results in {path}, to read in report.html", markup=False)
     if answers.refused:
         sys.exit(EXIT_NO_ANSWER)
+    if strict and answers.doubt:
+        console.coded("[red]failed[/]", f"--strict: {answers.doubt}", "answers-in-doubt")
+        sys.exit(EXIT_CHECK_FAILED)
 
 
 def calibrate(corners: Path, size: str, lens: Lens) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # estimators are a quarter of a second to import, for command
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
 
-LOADS = f"{RECONSTRUCT} or pf.read_loads(table, vehicle)"
+LOADS = f"{RECONSTRUCT}, pf.read_loads(table, vehicle) or {READ} of a folder with [loads]"
 FILM = "pf.read_film(pictures, times, vehicle)"
 METHODS = ("camera", "misalignment", "trim", "fused")
 _AS_RUN = ("misalignment", "trim", "camera", "fused")
@@ -278,13 +278,13 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
 
 
 @on_one_thread
-def estimate_misalignment(flown: Reconstruction | FlightLoads) -> DeflectionHistory:
+def estimate_misalignment(flown: Reconstruction | FlightLoads | Flight) -> DeflectionHistory:
     """Deflection that reconciles the accelerometers with the trajectory, seed paper eqs. [1] to [4].
 
     Parameters
     ----------
-    flown : Reconstruction or FlightLoads
-        From `reconstruct`, or from `read_loads` of another team's trajectory.
+    flown : Reconstruction, FlightLoads or Flight
+        From `reconstruct`, or from `read_loads` of another team's trajectory, or a flight with ``[loads]``.
 
     Raises
     ------
@@ -297,13 +297,13 @@ def estimate_misalignment(flown: Reconstruction | FlightLoads) -> DeflectionHist
 
 
 @on_one_thread
-def estimate_trim(flown: Reconstruction | FlightLoads) -> DeflectionHistory:
+def estimate_trim(flown: Reconstruction | FlightLoads | Flight) -> DeflectionHistory:
     """Deflection whose c.g. offset trims the vehicle at the angle it flew, seed paper eqs. [5] and [6].
 
     Parameters
     ----------
-    flown : Reconstruction or FlightLoads
-        From `reconstruct`, or from `read_loads` of another team's trajectory.
+    flown : Reconstruction, FlightLoads or Flight
+        From `reconstruct`, or from `read_loads` of another team's trajectory, or a flight with ``[loads]``.
 
     Raises
     ------
@@ -316,13 +316,13 @@ def estimate_trim(flown: Reconstruction | FlightLoads) -> DeflectionHistory:
 
 
 @on_one_thread
-def fuse(flown: Reconstruction | FlightLoads, progress: Progress | None = None) -> Deflections:
+def fuse(flown: Reconstruction | FlightLoads | Flight, progress: Progress | None = None) -> Deflections:
     """Deflection by every method that the flight has data for, and one posterior of them all.
 
     Parameters
     ----------
-    flown : Reconstruction or FlightLoads
-        From `reconstruct`, or from `read_loads` of another team's trajectory.
+    flown : Reconstruction, FlightLoads or Flight
+        From `reconstruct`, or from `read_loads` of another team's trajectory, or a flight with ``[loads]``.
     progress : callable, optional
 
     Returns
@@ -330,17 +330,25 @@ def fuse(flown: Reconstruction | FlightLoads, progress: Progress | None = None) 
     Deflections
         ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
     """
-    check_type("fuse", flown, (Reconstruction, FlightLoads), LOADS)
-    has_film = isinstance(flown, Reconstruction) and flown.telemetry.frames is not None
+    if not _has_loads(flown):
+        check_type("fuse", flown, (Reconstruction, FlightLoads), LOADS)
+    has_film = not isinstance(flown, FlightLoads) and flown.telemetry.frames is not None
     return estimate(flown, tuple(m for m in METHODS if m != "camera" or has_film), progress)
 
 
-def _loads_of(name: str, flown: Reconstruction | FlightLoads | None) -> FlightLoads:
-    """Loads that a public function was given, or those of its reconstruction."""
+def _has_loads(flown: object) -> bool:
+    """Whether this is a flight with a table of loads."""
+    return isinstance(flown, Flight) and flown.loads is not None
+
+
+def _loads_of(name: str, flown: Reconstruction | FlightLoads | Flight | None) -> FlightLoads:
+    """Loads that a public function was given, or those of its reconstruction or flight."""
     if isinstance(flown, FlightLoads):
         return flown
+    if isinstance(flown, Flight) and flown.loads is not None:
+        return flown.loads
     check_type(name, flown, (Reconstruction, FlightLoads), LOADS)
-    assert flown is not None
+    assert isinstance(flown, Reconstruction)
     return flown.required_loads()
 
 
@@ -353,13 +361,13 @@ def estimate(
 ) -> Deflections:
     """Run the methods asked for; one that cannot answer says why, and does not stop the others.
 
-    A `Flight` without a trajectory has an answer of the camera alone, loads have those of the other methods. The result
-    of ``camera`` is the camera's answer, where it is worked out elsewhere meanwhile, and that of ``time_bias`` the test
-    of the camera's time bias.
+    A `Flight` without a trajectory has an answer of the camera alone, loads, its own too, have those of the other
+    methods. The result of ``camera`` is the camera's answer, where it is worked out elsewhere meanwhile, and that of
+    ``time_bias`` the test of the camera's time bias.
     """
     report = progress or (lambda _fraction, _what: None)
     bet = flown if isinstance(flown, Reconstruction) else None
-    loads = flown if isinstance(flown, FlightLoads) else None
+    loads = flown if isinstance(flown, FlightLoads) else flown.loads if isinstance(flown, Flight) else None
     flight = flown if isinstance(flown, Flight) else None if bet is None else bet.flight
     answers = Deflections(bet=bet, loads=loads)
     fused, filmed = None, None

@@ -9,19 +9,28 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from flightmodel.atmosphere import standard_sounding
 from flightmodel.checks import ConfigError, GateError, Issue, Progress, check_path, nearest_name
+from flightmodel.config import parse_section
 from flightmodel.files import file_bytes
+from flightmodel.flightfolder import assumed_of
 from flightmodel.flightfolder import read_flight as read_telemetry
+from flightmodel.instruments import LoadsEntry, LoadsErrors
 from flightmodel.tabular import Tabular
-from flightmodel.telemetry import Sounding, Telemetry
+from flightmodel.telemetry import LoadsTable, Sounding, Telemetry
 from flightmodel.vehicle import MassProperties, Vehicle
 from recon.settings import Settings
+
+if TYPE_CHECKING:
+    from estimators.loads import FlightLoads
+    from postflight.loads_table import ReadLoads
 
 READ = "pf.read_flight(folder)"
 RECONSTRUCT = "pf.reconstruct(flight)"
@@ -78,6 +87,31 @@ class Flight(Tabular):
         """What the gate found in the data: gaps, frozen and missing samples, repairs of row order."""
         return self.telemetry.findings
 
+    @property
+    def loads(self) -> FlightLoads | None:
+        """Loads of the table that ``[loads]`` names, with the vehicle as assumed; None for a flight without one."""
+        return None if self.read_loads is None else self.read_loads.loads
+
+    @cached_property
+    def read_loads(self) -> ReadLoads | None:
+        """The table that ``[loads]`` names, as it was read; None for a flight without one."""
+        from postflight.loads_table import read_table_of_loads
+
+        table = self.telemetry.loads
+        if table is None:
+            return None
+        vehicle = self.telemetry.required_vehicle()
+        return read_table_of_loads(table.path, vehicle, table.columns, table.stated, table.time_s)
+
+    @property
+    def assumed(self) -> dict[str, dict[str, float]]:
+        """Standard deviations that neither flight.toml nor a column of the table of loads states, by table and key."""
+        known = set() if self.read_loads is None else self.read_loads.stated
+        return {
+            table: {key: sd for key, sd in sizes.items() if table != "loads" or key not in known}
+            for table, sizes in self.telemetry.assumed.items()
+        }
+
     def with_(self, **changes: Any) -> Flight:
         """Return a flight in which these assumptions differ.
 
@@ -103,7 +137,8 @@ class Flight(Tabular):
         camera_plane_lv_deg : float or None
             Assumed plane of the camera's deflection; None to estimate it.
         **settings : object
-            Any field of `Settings` (``without=("radar_a",)``, ``engine="filterpy"``, ``output_rate_hz=50.0``).
+            Any field of `Settings` (``without=("radar_a",)``, ``engine="filterpy"``, ``output_rate_hz=50.0``); of a
+            table of loads instead any of its errors (``flow_angle_sd_deg=0.5``).
 
         Raises
         ------
@@ -137,6 +172,7 @@ class Flight(Tabular):
         inertial = (("accelerometer", t.accelerometer), ("rates", t.rates), ("magnetometer", t.magnetometer))
         rows += [(name, "inertial" if name != "magnetometer" else "field", r.time_s) for name, r in inertial if r]
         rows += [("sun", "Sun sensors", t.sun.time_s)] if t.sun is not None else []
+        rows += [("loads", "trajectory", self.loads.time_s)] if self.loads is not None else []
         several = len(t.films) > 1
         rows += [(name if several else "frames", "video", film.time_s) for name, film in t.films.items()]
         table = []
@@ -161,7 +197,7 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
     progress : callable, optional
         Called with the fraction done and what is being done.
     needs_path : bool
-        Whether a flight without any tracker is refused; the camera alone needs none.
+        Whether a flight without any tracker is refused; the camera alone needs none, nor do ``[loads]``.
 
     Raises
     ------
@@ -175,7 +211,18 @@ def read_flight(folder: str | Path, progress: Progress | None = None, needs_path
         report = lambda fraction: progress(fraction, "reading telemetry")  # noqa: E731
     folder = check_path("read_flight: folder", folder)
     telemetry = read_telemetry(folder, report, needs_path)
-    return Flight(telemetry, folder=folder, as_read=_as_read(folder, telemetry))
+    flight = Flight(telemetry, folder=folder, as_read=_as_read(folder, telemetry))
+    _ = flight.loads  # whose table is refused here, not later
+    return flight
+
+
+def flight_of_table(table: Path, vehicle: Vehicle, columns: Mapping[str, str], entry: LoadsEntry) -> Flight:
+    """Flight that has a table of loads and nothing else, as `postflight.film_alone` makes one of a film."""
+    telemetry = Telemetry(
+        table.stem, "", False, vehicle, None, None, {}, standard_sounding(), None,
+        loads=LoadsTable(table, entry, dict(columns)), assumed={"loads": assumed_of(entry)},
+    )  # fmt: skip
+    return Flight(telemetry)
 
 
 def _as_read(folder: Path, telemetry: Telemetry) -> dict[str, bytes]:
@@ -221,6 +268,8 @@ def with_mass(telemetry: Telemetry, factor: float) -> Telemetry:
 
 def _changed(flight: Flight, name: str, value: Any) -> Flight:
     """One assumption changed; `GateError` where it cannot be."""
+    if flight.telemetry.loads is not None and name not in _OF_VEHICLE:
+        return replace(flight, telemetry=_loads_error(flight.telemetry, name, value))
     if name in SETTINGS:
         return replace(flight, settings=_with_setting(flight.settings, name, value))
     if name == "camera_plane_lv_deg":
@@ -318,6 +367,20 @@ def _attitude_prior(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
     return replace(telemetry, attitude_prior=None)
 
 
+def _loads_error(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
+    """Telemetry in which the table of loads has another standard deviation."""
+    table = telemetry.loads
+    assert table is not None
+    if name not in LoadsErrors.model_fields:
+        known = (*_OF_VEHICLE, *LoadsErrors.model_fields)
+        words = f"a table of loads takes none such{nearest_name(name, known)}; known: {', '.join(known)}"
+        raise GateError(f"assumption '{name}': {words}", "name-unknown")
+    stated = table.stated.model_dump(exclude_unset=True) | {name: value}
+    entry = parse_section(LoadsEntry, stated, "assumption")
+    return replace(telemetry, loads=replace(table, stated=entry), assumed={"loads": assumed_of(entry)})
+
+
+_OF_VEHICLE = ("c_a", "c_n", "c_m", "mass_kg", "cg_shift_body_m", "joint_station_m", "camera_plane_lv_deg")
 ASSUMPTIONS: dict[str, Callable[[Telemetry, str, Any], Telemetry]] = {
     "c_a": _coefficient,
     "c_n": _coefficient,

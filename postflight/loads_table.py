@@ -3,7 +3,7 @@
 A team that has its own best-estimated trajectory needs no radar data and no filter of ours to estimate the deflection.
 Columns and units are recognised as by ``postflight import``. What a header leaves open is refused, with the way to
 state it; what a table does not state of its errors gets a default that widens the answer
-(`estimators.loads.LoadsErrors`), unless a column ``<name>_sd`` states it.
+(`flightmodel.instruments.LoadsErrors`), unless a column ``<name>_sd`` states it.
 
 Airspeed and Mach number give the speed of sound, airspeed and dynamic pressure the density. Both are compared with the
 standard atmosphere at the table's altitude, and the axial force with the vehicle's C_A: a wrong unit, sign or vehicle
@@ -17,92 +17,38 @@ AIAA 2011-2571, section II; US Standard Atmosphere, 1976.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, LoadsColumns, LoadsErrors, loads_from_arrays
+from estimators.loads import MIN_AXIAL_MPS2, FlightLoads, LoadsColumns, loads_from_arrays
 from flightmodel.airdata import lateral_angles
 from flightmodel.atmosphere import sound_speed, us76
 from flightmodel.checks import FloatArray, GateError, Issue, nearest_name
 from flightmodel.config import parse_section
 from flightmodel.deflection import lv_direction
-from flightmodel.tables import to_si
-from flightmodel.units import read_unit
+from flightmodel.instruments import LoadsEntry
 from flightmodel.vehicle import Vehicle, read_vehicle
-from postflight.intake.column_recognition import Recogniser, SourceProposal, column_unit
 from postflight.intake.freeform_tables import FreeFormTable
-from postflight.intake.headers import ColumnName
+from postflight.intake.loads_columns import FORCE, MOTION, OWN_COLUMNS, RATES, FoundColumns, find_columns
 from postflight.intake.stored_tables import read_tables
 
-
-class _Meaning(NamedTuple):
-    """Kind of a quantity, and the words of a header that mean it."""
-
-    kind: str
-    words: tuple[str, ...]
-
-
-# the longer name first: "alpha total" is no alpha
-_SCALARS = {
-    "mach": _Meaning("fraction", ("mach", "ma")),
-    "dynamic_pressure": _Meaning("pressure", ("qbar", "dynamicpressure", "dynpressure", "dynp", "qdyn", "qinf", "q")),
-    "airspeed": _Meaning("speed", ("airspeed", "tas", "vtas", "vair", "vrel", "velocity", "speed", "v")),
-    "altitude": _Meaning("length", ("altitude", "alt", "height", "h")),
-    "alpha_total": _Meaning("angle", ("alphatotalwind", "alphatotal", "totalalpha", "alphat", "totalangleofattack")),
-    "clock": _Meaning("angle", ("clocklv", "clock", "clockangle", "clockingangle")),
-    "alpha": _Meaning("angle", ("alpha", "aoa", "angleofattack")),
-    "beta": _Meaning("angle", ("beta", "sideslip", "aos", "angleofsideslip")),
-    "v_north": _Meaning("speed", ("vnorth", "vn", "northvelocity", "velocitynorth", "velnorth", "veln")),
-    "v_east": _Meaning("speed", ("veast", "ve", "eastvelocity", "velocityeast", "veleast", "vele")),
-    "v_down": _Meaning("speed", ("vdown", "vd", "downvelocity", "velocitydown", "veldown", "veld")),
-    "wind_north": _Meaning("speed", ("windnorth", "northwind", "windn", "vwindnorth", "vwn")),
-    "wind_east": _Meaning("speed", ("windeast", "eastwind", "winde", "vwindeast", "vwe")),
-    "yaw": _Meaning("angle", ("yaw", "psi", "heading")),
-    "pitch": _Meaning("angle", ("pitch", "theta")),
-    "roll": _Meaning("angle", ("roll", "phi", "bank")),
-}
-_MOTION = ("v_north", "v_east", "v_down", "wind_north", "wind_east", "yaw", "pitch", "roll")
-_WITH_SD = ("dynamic_pressure", "alpha", "beta", "alpha_total")
-# columns of this program's own bet.csv that the recognition by words would not choose among several
-_OWN = {
-    "ax": "ax_cg_mps2", "ay": "ay_cg_mps2", "az": "az_cg_mps2",
-    "p": "p_body_degps", "q": "q_body_degps", "r": "r_body_degps", "wind_sd": "wind_sd_mps",
-}  # fmt: skip
 # all of its columns that loads are made from
 LOADS_COLUMNS = (
-    "t_s", *_OWN.values(), "mach", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", "airspeed_mps", "alt_m",
+    "t_s", *OWN_COLUMNS.values(), "mach", "dynamic_pressure_pa", "dynamic_pressure_sd_pa", "airspeed_mps", "alt_m",
     "alpha_total_wind_deg", "alpha_total_wind_sd_deg", "clock_lv_deg",
 )  # fmt: skip
-_FORCE, _RATES = ("ax", "ay", "az"), ("p", "q", "r")
-_TRIADS = {"sensors.accelerometer": _FORCE, "sensors.rates": _RATES}
+# errors that columns state, and the keys that they take the place of
+_OWN_ERRORS = {
+    "flow_sd_rad": "flow_angle_sd_deg", "dynamic_pressure_sd_pa": "dynamic_pressure_sd_percent",
+    "wind_sd_mps": "wind_sd_mps",
+}  # fmt: skip
 # a day's temperature departs from the standard by a fifth at the most, in the mesosphere; the root of that
 _SOUND_OFF = 0.12
 _DENSITY_FACTOR, _STANDARD_HOLDS_M = 2.0, 80e3  # far beyond what a day's density departs from the standard's below
 _AXIAL_FACTOR = 1.5  # of the vehicle's own: mass, area and C_A of a preflight model are known better by far
-
-
-@dataclass
-class _Columns:
-    """Columns of a table in SI units by their short names; what could not be read is among the faults."""
-
-    label: str
-    values: dict[str, FloatArray] = field(default_factory=dict)
-    faults: list[Issue] = field(default_factory=list)
-    open: set[str] = field(default_factory=set)  # found, with a fault
-    unused: list[str] = field(default_factory=list)
-
-    def leave_open(self, short: str, words: str, code: str) -> None:
-        """Keep what is wrong with a quantity's column."""
-        self.open.add(short)
-        self.faults.append(Issue(f"{self.label}: {words}", code))
-
-    def has(self, *names: str) -> bool:
-        """Whether all of them were found."""
-        return all(name in self.values for name in names)
 
 
 def read_loads(
@@ -132,7 +78,7 @@ def read_loads(
         Place of the accelerometer: the undeflected c.g., a package of the vehicle file, or a place in body axes from
         the datum, m.
     **errors
-        Keys of `estimators.loads.LoadsErrors`, such as ``flow_angle_sd_deg=0.5``.
+        Keys of `flightmodel.instruments.LoadsErrors`, such as ``flow_angle_sd_deg=0.5``.
 
     Returns
     -------
@@ -144,24 +90,30 @@ def read_loads(
     GateError
         With every column that is missing or whose unit is open, or where columns contradict each other.
     """
-    stated = parse_section(LoadsErrors, errors, "read_loads")
+    entry = parse_section(LoadsEntry, {"file": "", "acceleration_at": acceleration_at, **errors}, "read_loads")
     made = vehicle if isinstance(vehicle, Vehicle) else read_vehicle(vehicle)
-    return loads_and_unused(table, made, dict(columns or {}), acceleration_at, stated)[0]
+    return read_table_of_loads(table, made, columns or {}, entry).loads
 
 
-def loads_and_unused(
-    table: str | Path | pd.DataFrame,
-    vehicle: Vehicle,
-    columns: dict[str, str],
-    acceleration_at: str | tuple[float, float, float],
-    errors: LoadsErrors,
-) -> tuple[FlightLoads, list[str]]:
-    """Loads, and the names of the table's columns that were not used."""
-    arm_m = _cg_from_sensor(vehicle, acceleration_at)
-    found = _read(_as_table(table), columns)
-    loads = loads_from_arrays(vehicle, _columns(found), errors, arm_m)
-    _check(found.label, loads)
-    return loads, found.unused
+class ReadLoads(NamedTuple):
+    """Loads, the table's columns that are not used, and keys of `LoadsErrors` whose errors columns of it state."""
+
+    loads: FlightLoads
+    unused: list[str]
+    stated: set[str]
+
+
+def read_table_of_loads(
+    table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: Mapping[str, str], entry: LoadsEntry,
+    time_s: FloatArray | None = None,
+) -> ReadLoads:  # fmt: skip
+    """Loads by what flight.toml or a command states of a table; ``time_s`` (n,) are clock times that it has."""
+    arm_m = _cg_from_sensor(vehicle, entry.acceleration_at)
+    found = find_columns(_as_table(table), dict(columns), time_s)
+    made = _columns(found, entry)
+    loads = loads_from_arrays(vehicle, made, entry, arm_m)
+    _check(found.table.label, loads)
+    return ReadLoads(loads, found.unused, {key for name, key in _OWN_ERRORS.items() if getattr(made, name) is not None})
 
 
 def _as_table(table: str | Path | pd.DataFrame) -> FreeFormTable:
@@ -189,148 +141,28 @@ def _cg_from_sensor(vehicle: Vehicle, at: str | tuple[float, float, float]) -> F
     return np.asarray(vehicle.cg_m - np.asarray(at, dtype=float))
 
 
-# columns
-
-
-def _read(table: FreeFormTable, chosen: dict[str, str]) -> _Columns:
-    """Every quantity that the table holds, with a fault for each that is open."""
-    out = _Columns(table.label)
-    own = {short: name for short, name in _OWN.items() if name in table.names}
-    recogniser = Recogniser(table)
-    _read_time(recogniser, chosen, out)
-    stated = own | chosen
-    for short, text in stated.items():
-        _read_stated(recogniser, short, text, out)
-    for source in recogniser.three_axis_sensors():
-        if source.section in _TRIADS:
-            _read_triad(recogniser, source, out)
-    for short, meaning in _SCALARS.items():
-        for name in (short, f"{short}_sd") if short in _WITH_SD else (short,):
-            if name not in stated:
-                _read_scalar(recogniser, name, meaning, out)
-    out.unused = [table.names[k] for k in sorted(recogniser.free)]
-    return out
-
-
-def _read_time(recogniser: Recogniser, chosen: dict[str, str], out: _Columns) -> None:
-    """Seconds in the table's own time column."""
-    text = chosen.pop("t", None)
-    if text is not None:
-        _read_stated(recogniser, "t", text, out)
-        return
-    time = recogniser.time
-    if time is None or time.format != "seconds":
-        out.leave_open("t", 'no column of seconds; state it, as columns={"t": "TIME:s"}', "column-missing")
-        return
-    if not time.unit:
-        out.leave_open(
-            "t", f'time: {time.why}; state its unit, as columns={{"t": "{time.columns[0]}:s"}}', "unit-unknown"
-        )
-        return
-    values = recogniser.table.numbers(recogniser.table.names.index(time.columns[0]))
-    out.values["t"] = to_si(values.copy(), time.unit)
-
-
-def _read_stated(recogniser: Recogniser, short: str, text: str, out: _Columns) -> None:
-    """A quantity whose column, and unit behind a colon, is stated."""
-    table, (name, _, unit) = recogniser.table, text.rpartition(":") if ":" in text else (text, "", "")
-    if name not in table.names:
-        out.leave_open(short, f"{short}: no column '{name}'{nearest_name(name, table.names)}", "column-missing")
-        return
-    k = table.names.index(name)
-    kind = "time" if short == "t" else _kind_of(short)
-    units = [unit] if unit else recogniser.named[k].units(kind) or (["1"] if kind == "fraction" else [])
-    known = read_unit(units[0]) if units else None
-    if known is None or known.kind != kind:
-        out.leave_open(short, f"column '{name}' ({short}): state its unit of {kind}, as '{name}:UNIT'", "unit-unknown")
-        return
-    out.values[short] = to_si(table.numbers(k), units[0])
-    recogniser.free.discard(k)
-
-
-def _kind_of(short: str) -> str:
-    """Kind of a quantity by its short name."""
-    base = short.removesuffix("_sd")
-    if base in _SCALARS:
-        return _SCALARS[base].kind
-    return "acceleration" if base in _FORCE else "rate" if base in _RATES else "speed"
-
-
-def _read_triad(recogniser: Recogniser, source: SourceProposal, out: _Columns) -> None:
-    """Three axes of accelerometer or gyros, as the importer recognises them."""
-    shorts = _TRIADS[source.section]
-    if out.has(*shorts):
-        return
-    for short, proposal in zip(shorts, source.columns, strict=True):
-        if not proposal.unit:
-            words = f"its unit is open ({proposal.why}); state it, as columns={{'{short}': '{proposal.column}:UNIT'}}"
-            out.leave_open(short, f"column '{proposal.column}' ({short}): {words}", "unit-unknown")
-            continue
-        values = recogniser.table.numbers(recogniser.table.names.index(proposal.column))
-        out.values.setdefault(short, to_si(values, proposal.unit))
-
-
-def _read_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: _Columns) -> None:
-    """One quantity by the words of its header, the first of them that a column has."""
-    table, wants_sd = recogniser.table, short.endswith("_sd")
-    fitting = [k for k in sorted(recogniser.free) if _is_sd(recogniser.named[k]) == wants_sd]
-    for word in meaning.words:
-        for k in fitting:
-            named = recogniser.named[k]
-            if _stem(named, short) != word or (named.kinds and meaning.kind not in named.kinds):
-                continue
-            values = table.numbers(k)
-            units = named.units(meaning.kind) or (["1"] if meaning.kind == "fraction" and not named.kinds else [])
-            unit = units[0] if units else "" if named.unknown_unit else column_unit(short, meaning.kind, values)[0]
-            if not unit:
-                words = f"its unit of {meaning.kind} is open; state it, as columns={{'{short}': '{named.name}:UNIT'}}"
-                out.leave_open(short, f"column '{named.name}' ({short}): {words}", "unit-unknown")
-            else:
-                out.values[short] = to_si(values, unit)
-            recogniser.free.discard(k)
-            return
-
-
-def _stem(named: ColumnName, short: str) -> str:
-    """Words of a name in one, without those that say whose it is or that it is a standard deviation."""
-    said = {"sd", "sigma", "std", "deg", "body", "cg"} | (set() if short.startswith("wind") else {"wind"})
-    return "".join(token for token in named.tokens if token not in said)
-
-
-def _is_sd(named: ColumnName) -> bool:
-    return bool({"sd", "sigma", "std"} & set(named.tokens))
-
-
 # what follows from the columns
 
 
-def _columns(found: _Columns) -> LoadsColumns:
+def _columns(found: FoundColumns, entry: LoadsEntry) -> LoadsColumns:
     """Columns as the loads need them; `GateError` with everything that is missing."""
-    faults, values = found.faults, found.values
-    there = found.open | set(values)
-    moving = {"v_north", "yaw"} <= there
-    flow = "clock" if "alpha_total" in there else ", ".join(m for m in _MOTION if m not in there)
-    flow = flow if moving or "alpha_total" in there else "alpha and beta"
-    if set(_MOTION) <= there:
-        there.add("airspeed")
-    missing = [name for name in ("t", *_FORCE, *_RATES, "altitude") if name not in there]
-    if not any(set(names) <= there for names in (("alpha", "beta"), ("alpha_total", "clock"), _MOTION)):
-        missing.append(flow)
-    if len({"mach", "dynamic_pressure", "airspeed"} & there) < 2:
-        missing.append("two of mach, dynamic_pressure and airspeed")
-    if missing:
-        words = f'{found.label}: no column of {", ".join(missing)}; state which it is, as columns={{"ax": "NAME:UNIT"}}'
-        faults.append(Issue(words, "column-missing"))
+    faults = found.faults
+    if missing := found.missing:
+        found.leave_open(missing[0], f"no column of {', '.join(missing)}", "column-missing")
     if faults:
         raise GateError(faults)
+    values = found.values()
+    values["t"] += entry.time.offset_s
     velocity = _velocity_air_body(values)
     _complete(values, velocity)
     rows = np.isfinite(np.column_stack([v for k, v in values.items() if not k.endswith("_sd")])).all(axis=1)
+    if entry.use_s is not None:
+        rows &= np.any([(values["t"] >= start) & (values["t"] <= stop) for start, stop in entry.use_s], axis=0)
     at = {name: column[rows] for name, column in values.items()}
     return LoadsColumns(
         time_s=at["t"],
-        specific_force_body_mps2=np.column_stack([at[name] for name in _FORCE]),
-        rate_body_radps=np.column_stack([at[name] for name in _RATES]),
+        specific_force_body_mps2=np.column_stack([at[name] for name in FORCE]),
+        rate_body_radps=np.column_stack([at[name] for name in RATES]),
         flow_yz_rad=_flow(at, None if velocity is None else velocity[rows]),
         mach=at["mach"],
         dynamic_pressure_pa=at["dynamic_pressure"],
@@ -346,9 +178,9 @@ def _velocity_air_body(values: dict[str, FloatArray]) -> FloatArray | None:
     """Velocity relative to the air (n, 3), body axes, by velocity, wind and attitude; None where one is missing."""
     from scipy.spatial.transform import Rotation  # for the tables that state it
 
-    if not set(_MOTION) <= set(values):
+    if not set(MOTION) <= set(values):
         return None
-    v_north, v_east, v_down, wind_north, wind_east, *turns = (values[name] for name in _MOTION)
+    v_north, v_east, v_down, wind_north, wind_east, *turns = (values[name] for name in MOTION)
     known = np.isfinite(turns).all(axis=0)
     velocity = np.full((len(v_down), 3), np.nan)
     to_ned = Rotation.from_euler("ZYX", np.column_stack(turns)[known])

@@ -31,9 +31,10 @@ NO_VIDEO = "video-missing"  # code of the refusal
 BY_LOADS = ("misalignment", "trim", "fused")
 _NO_TRACKER = Issue(
     "there is no radar, receiver or entry state, which the trajectory needs: state [radars.NAME], [gnss.NAME] or "
-    "[start.state]; a table of another trajectory takes its place (--loads, pf.read_loads)",
+    "[start.state]; a table of another trajectory takes its place ([loads], pf.read_loads)",
     "tracker-missing",
 )
+_OTHER_TEAMS = Issue("the trajectory is another team's table of loads, so none is reconstructed", "tracker-missing")
 _NO_FILM = Issue("there is no film, which the camera needs: [frames] in flight.toml names one", NO_VIDEO)
 _NO_VEHICLE = Issue(
     'there is no vehicle file, which every estimate of the deflection needs: write vehicle = "..." in flight.toml',
@@ -60,19 +61,20 @@ class Inputs:
     def of(cls, given: Telemetry | Sources | FlightLoads) -> Inputs:
         """Find what telemetry, the sources of a flight folder, or loads hold."""
         if isinstance(given, Sources):
-            inertial, state = {"accelerometer", "rates"} <= set(given.triads), given.state
+            inertial, state, loads = {"accelerometer", "rates"} <= set(given.triads), given.state, given.loads
         elif isinstance(given, Telemetry):
             inertial, state = given.accelerometer is not None and given.rates is not None, given.start.state
+            loads = given.loads
         else:
             return cls(vehicle=True, loads=True)
         tracker = bool(given.radars or given.gnss or state is not None)
-        return cls(given.vehicle is not None, bool(given.films), inertial, tracker)
+        return cls(given.vehicle is not None, bool(given.films), inertial, tracker, loads is not None)
 
     def missing(self) -> dict[str, Issue]:
         """Why a method cannot run, by method; those that can are not among them."""
         out = {}
         if not self.tracker:
-            out["trajectory"] = _NO_TRACKER
+            out["trajectory"] = _OTHER_TEAMS if self.loads else _NO_TRACKER
         if not (self.film and self.vehicle):
             out["camera"] = _NO_VEHICLE if self.film else _NO_FILM
         if not (self.vehicle and (self.loads or (self.inertial and self.tracker))):

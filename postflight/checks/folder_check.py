@@ -100,7 +100,8 @@ class Report(Tabular):
     def can_run(self) -> str:
         """Methods that can run, and what the others lack."""
         words = ["nothing before the refused inputs are corrected"] if self.refused else []
-        if self.inputs is not None and not self.refused:
+        words += ["nothing before the placeholders are filled in"] if self.fill_in and not self.refused else []
+        if self.inputs is not None and not words:
             words.append(str(self.inputs))
         return "; ".join([*words, *(f"{inputs.names} ({command})" for command, inputs in self.alone.items())])
 
@@ -153,8 +154,8 @@ def check_folder(folder: Path) -> Report:
     gate = found.gate
     if gate.config or gate.faults:
         _refuse(report, folder, [*gate.config, *gate.faults], 3 if gate.faults else 2)
-    report.facts = _facts(found)
     report.assumed = assumed_errors(found.spec, found.radars, found.gnss)
+    report.facts = _facts(found) + _loads(report, found)
     report.inputs = Inputs.of(found)
     if found.vehicle is not None and "misalignment" in report.inputs.missing():
         _runs_alone(report, folder, found.vehicle.source)
@@ -221,6 +222,24 @@ def _refuse(report: Report, folder: Path, faults: Sequence[Issue], code: int) ->
     report.fill_in = [f"{path}: key '{key}' {FILL_IN}" for path, keys in still_open.items() for key in keys]
     report.refused = [fault for fault in faults if FILL_IN not in fault]
     report.exit_code = code
+
+
+def _loads(report: Report, found: Sources) -> list[Fact]:
+    """Fact of the table of loads, whose faults are refusals."""
+    if found.loads is None or found.vehicle is None:
+        return []
+    from postflight.loads_table import read_table_of_loads
+
+    table, entry = found.loads, found.loads.stated
+    try:
+        loads, _, stated = read_table_of_loads(table.path, found.vehicle, table.columns, entry, table.time_s)
+    except GateError as fault:
+        _refuse(report, found.gate.folder, [*report.refused, *fault.faults], report.exit_code or fault.exit_code)
+        return []
+    left = {key: sd for key, sd in report.assumed.pop("loads", {}).items() if key not in stated}
+    report.assumed |= {"loads": left} if left else {}
+    t = loads.time_s
+    return [Fact("loads", entry.file, len(t), float(t[0]), float(t[-1]), float(1.0 / np.median(np.diff(t))), 0)]
 
 
 def _facts(found: Sources) -> list[Fact]:

@@ -313,7 +313,7 @@ class Recogniser:
         elif self.time is None:
             found = []
         else:
-            found = self.three_axis_sensors() + self._radar() + self._receiver() + self._barometer()
+            found = self.three_axis_sensors() + self.radar() + self._receiver() + self._barometer()
         for source in found:
             is_receiver = source.section.startswith("gnss.")
             source.time = self.fix_time if is_receiver and self.fix_time is not None else self.time
@@ -483,7 +483,7 @@ class Recogniser:
                 found.append(self._proposal(quantity, k, unit, STATED, ""))
         return found
 
-    def _radar(self) -> list[SourceProposal]:
+    def radar(self) -> list[SourceProposal]:
         """Slant range, azimuth, elevation; angles in whole degrees beside fixes are computed from these."""
         if not all(self.columns_of(q.short) for q in tables.RADAR):
             return []

@@ -55,6 +55,7 @@ from postflight.intake.column_recognition import (
 from postflight.intake.flight_form import placeholders, section_text, start_text, template
 from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import MARKS, fold, parse_column_name
+from postflight.intake.loads_columns import loads_proposal
 from postflight.intake.stored_tables import read_tables
 from postflight.terminal import terminal
 
@@ -557,12 +558,17 @@ def _proposals(
     added, shown, unrecognised, unused_tables = [], [], [], []
     videos = [*came.videos, *_earlier_videos(folder)]
     cameras = _cameras_of(folder, tables)
-    for table, place in zip(came.tables, places, strict=True):
+    # another team's trajectory last: whether it is wanted depends on what is there to reconstruct one from
+    read = [(table, place, loads_proposal(table)) for table, place in zip(came.tables, places, strict=True)]
+    for table, place, loads in sorted(read, key=lambda each: each[2] is not None):
         add_clock_columns(table)
         frames = frame_list(table, videos, cameras, folder)
         recogniser = Recogniser(table)
-        found, unused = recogniser.proposals() if frames is None else ([frames], [])
-        if frames is None and recogniser.may_be_inertial():
+        if loads is not None:
+            found, unused = [loads[0]], loads[1]
+        else:
+            found, unused = recogniser.proposals() if frames is None else ([frames], [])
+        if frames is None and loads is None and recogniser.may_be_inertial():
             unrecognised.append(table.label)
         shown.append((table, found, unused))
         file = place.relative_to(folder).as_posix()
@@ -570,13 +576,14 @@ def _proposals(
             unused_tables.append(_not_recognised(table, file))
         asked = ""  # the section where this table's time is asked for
         for source in found:
-            if source.section in taken:
-                words = f"{file}: flight.toml has a [{source.section}] already; this one stands there as a comment"
+            question = _question(source.section, taken)
+            if question:
+                words = f"{file}: [{source.section}] stands in flight.toml as a comment: {question}"
                 unused_tables.append(Issue(words, "given-twice"))
             time = source.time
             is_open = time is not None and time is recogniser.time and time.is_open
-            added.append(section_text(source, file, table.notes, source.section in taken, asked if is_open else ""))
-            if is_open and source.section not in taken:
+            added.append(section_text(source, file, table.notes, question, asked if is_open else ""))
+            if is_open and not question:
                 asked = asked or source.section
             taken.add(source.section)
     listed = "".join(added)
@@ -584,6 +591,15 @@ def _proposals(
     start = start_text(taken, tables, unrecognised)
     rest = "" if "start" in tables else _rest_text(shown)
     return "".join(f"\n{text}" for text in (*added, start, rest) if text), shown, unused_tables
+
+
+def _question(section: str, taken: set[str]) -> str:
+    """Why a proposed table may not be wanted beside those that are ``taken``; empty where it is."""
+    if section in taken:
+        return f"[{section}] is there already. Which is right? Take one out."
+    if section == "loads" and any(name.startswith(("radars.", "gnss.", "sensors.")) for name in taken):
+        return "another team's trajectory. It is wanted where none is reconstructed from the sensors and trackers here."
+    return ""
 
 
 def _not_recognised(table: FreeFormTable, file: str) -> Issue:
@@ -648,7 +664,8 @@ def _earlier_videos(folder: Path) -> list[Video]:
 
 def _sections(tables: dict[str, Any]) -> set[str]:
     groups = ("sensors", "radars", "gnss", "barometers")
-    return {"atmosphere", "frames"} & set(tables) | {f"{g}.{name}" for g in groups for name in tables.get(g, {})}
+    alone = {"atmosphere", "frames", "loads"} & set(tables)
+    return alone | {f"{g}.{name}" for g in groups for name in tables.get(g, {})}
 
 
 def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> None:

@@ -38,6 +38,7 @@ from postflight.intake.column_recognition import (
     TimeProposal,
     quoted,
 )
+from postflight.intake.loads_columns import kind_of
 from postflight.terminal import terminal
 
 _EVERY_QUANTITY = (*ACCELEROMETER, *RATES, *MAGNETOMETER, *RADAR, *GNSS, *BAROMETER, *ATMOSPHERE)
@@ -165,7 +166,7 @@ def _open_keys(value: Any, at: str) -> Iterator[str]:
 # proposals
 
 
-def section_text(source: SourceProposal, file: str, notes: list[str], taken: bool, timed_as: str = "") -> str:
+def section_text(source: SourceProposal, file: str, notes: list[str], question: str, timed_as: str = "") -> str:
     """Return the TOML of one proposal.
 
     Parameters
@@ -175,8 +176,8 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
         Of its table, relative to flight.toml.
     notes : list of str
         What was changed in the file, as comments.
-    taken : bool
-        Whether flight.toml has that table already: all becomes comments below a question.
+    question : str
+        Why the table may not be wanted, such as that flight.toml has it already: all becomes comments below it.
     timed_as : str
         Earlier section of the same file where the time is asked for; empty for none.
     """
@@ -192,9 +193,8 @@ def section_text(source: SourceProposal, file: str, notes: list[str], taken: boo
     if declared:
         lines += ["", f"[{source.section}.columns]"]
         lines += [_column_line(m) for m in declared]
-    if taken:
-        first = f"# QUESTION: [{source.section}] is there already. Which is right? Take one out."
-        lines = [first, *(f"# {line}".rstrip() for line in lines)]
+    if question:
+        lines = [f"# QUESTION: {question}", *(f"# {line}".rstrip() for line in lines)]
     return "\n".join(lines) + "\n"
 
 
@@ -275,8 +275,8 @@ def _column_line(m: ColumnProposal) -> str:
 
 def _units_of(short: str) -> list[str]:
     """Units that a quantity may have, the usual ones first."""
-    known = next((q for q in _EVERY_QUANTITY if q.short == short), None)
-    return [u for u, (kind, _, _) in UNITS.items() if known is not None and kind == known.kind]
+    wanted = next((q.kind for q in _EVERY_QUANTITY if q.short == short), kind_of(short))
+    return [u for u, (kind, _, _) in UNITS.items() if kind == wanted]
 
 
 def _one_line(text: str) -> str:

@@ -20,7 +20,6 @@ from postflight.plots.style import (
     COLOUR,
     LABEL,
     STROKE,
-    TIME,
     WIDE_BAND,
     band,
     in_style,
@@ -29,7 +28,17 @@ from postflight.plots.style import (
     titled,
     with_holes,
 )
-from postflight.plots.subject import FUSE, Drawable, answers_of, bet_of, flow_of, fused_of, lacking, words_of
+from postflight.plots.subject import (
+    FUSE,
+    Drawable,
+    answers_of,
+    bet_of,
+    flow_of,
+    fused_of,
+    lacking,
+    time_label,
+    words_of,
+)
 from postflight.run_folder import best_in_words
 from postflight.runs import Run
 
@@ -62,7 +71,7 @@ def figure_summary(
     """
     answers = answers or answers_of("figure_summary", flown)
     air = flow_of("figure_summary", flown)
-    pictures = pictures and "camera" in answers.histories
+    pictures = pictures and "camera" in answers.histories and answers.loads is None
     figure = Figure(figsize=(9.0, 9.0 if pictures else 6.4))
     place = figure
     if pictures:
@@ -80,7 +89,7 @@ def figure_summary(
     upper.set(ylabel="deflection of aeroshell\nagainst centerbody (deg)", xlim=window(air), ylim=(0, _top_deg(answers)))
     legend_above(upper, 5, "bands: 1 sd; dotted: peak q")
     trajectory_angle(lower, air, "centerbody total angle of attack, 1 sd")
-    lower.set(ylabel="angle of attack (deg)", xlabel=TIME)
+    lower.set(ylabel="angle of attack (deg)", xlabel=time_label(flown))
     fit_height(lower, air)
     legend_above(lower, 1)
     pressure = lower.twinx()
@@ -118,7 +127,7 @@ def figure_deflection(flown: DeflectionHistory | Deflections | Run) -> Figure:
         clear = np.isfinite(history.theta_rad) & ~(history.theta_sd_rad > history.theta_rad)
         plane = np.where(clear, np.rad2deg(history.plane_lv_rad), np.nan)
         lower.plot(history.time_s, plane, ".", ms=2, color=COLOUR.get(method, COLOUR["estimate"]))
-    lower.set(ylabel="plane (deg LV), where\ndeflection > its sd", xlabel=TIME, ylim=(0.0, 360.0))
+    lower.set(ylabel="plane (deg LV), where\ndeflection > its sd", xlabel=time_label(answers), ylim=(0.0, 360.0))
     return titled(figure, "Deflection of the aeroshell", words_of(answers))
 
 
@@ -175,7 +184,7 @@ def figure_fusion(flown: Deflections) -> Figure:
         t, (drawn, sd_drawn) = with_holes(history.time_s, [values, spread])
         ax.plot(t, drawn, color=COLOUR["fused"], label="fused")
         band(ax, t, drawn, sd_drawn, COLOUR["fused"], label="1 sd")
-        ax.set(ylabel=label, xlabel=TIME, ylim=(0.0, top))
+        ax.set(ylabel=label, xlabel=time_label(flown), ylim=(0.0, top))
         legend_above(ax, 2)
     if fused.limbs is None:
         line.set_axis_off()

@@ -42,6 +42,7 @@ from postflight.plots.subject import (
     history_of,
     loads_of,
     reconstruction_of,
+    time_label,
     words_of,
 )
 from postflight.reconstruction import Reconstruction
@@ -190,7 +191,8 @@ def frames_with_camera(
     from estimators.overlay import Overlay
     from estimators.virtual_camera import deformation_of
 
-    figure = Figure(figsize=(6.0 * len(frames), 4.4))
+    height, width = np.shape(frames[0])[:2]
+    figure = Figure(figsize=(6.0 * len(frames), 6.0 * height / width + 0.65))
     axes = np.atleast_1d(figure.subplots(1, len(frames)))
     view, overlay = oriented.view, Overlay(oriented.view, meshes or {})
     for k, ax in enumerate(axes):
@@ -288,7 +290,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
 
 
 def _angles(ax: Axes, air: AirData | Flow) -> None:
-    ax.set(xlim=window(air), ylabel="total angle of attack (deg)", xlabel=TIME)
+    ax.set(xlim=window(air), ylabel="total angle of attack (deg)", xlabel=time_label(air))
     fit_height(ax, air, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)
 

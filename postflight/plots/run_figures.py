@@ -88,12 +88,13 @@ def draw_deflections(flight: Reconstruction, figures: FigureFolder, answers: Def
     _draw_loads(answers, figures)
 
 
-def draw_alone(answers: Deflections, figures: FigureFolder, film: Flight | None) -> None:
-    """Draw answers by a table of loads, or by a ``film``, without a trajectory of this program."""
-    if film is None:
+def draw_alone(answers: Deflections, figures: FigureFolder, flight: Flight) -> None:
+    """Draw answers that no run holds: by a table of loads, by a film, or by a trajectory that is not written."""
+    if "camera" in answers.histories:
+        _draw_cameras(flight, answers.histories["camera"], figures)
+    if answers.loads is not None:
         _draw_loads(answers, figures)
-    elif "camera" in answers.histories:
-        _draw_cameras(film, answers.histories["camera"], figures)
+    elif answers.histories:
         figures.draw("deflection", figure_deflection, answers)
 
 

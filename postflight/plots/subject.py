@@ -19,7 +19,7 @@ from postflight.deflections import Deflections
 from postflight.filming import by_camera, keep_oriented
 from postflight.flight import RECONSTRUCT, Flight
 from postflight.methods import NO_VIDEO
-from postflight.plots.style import flight_words
+from postflight.plots.style import TIME, flight_words
 from postflight.reconstruction import Reconstruction
 from postflight.runs import Run
 
@@ -135,5 +135,12 @@ def words_of(given: object) -> str:
         return flight_words(source.header["flight"], bool(source.header["synthetic"]), source.changes)
     if isinstance(source, Reconstruction | Flight):
         flight = source if isinstance(source, Flight) else source.flight
+        if not flight.telemetry.t0_utc:  # a film alone
+            return "; ".join((f"{flight.telemetry.required_vehicle().name}: film '{flight.name}'", *flight.changes))
         return flight_words(flight.name, flight.telemetry.synthetic, flight.changes)
     return f"{source.vehicle.name}: loads of a table" if isinstance(source, FlightLoads) else ""
+
+
+def time_label(given: object) -> str:
+    """Label of a time axis: times of a table or a film alone have a zero of their own."""
+    return TIME if isinstance(source_of(given), Reconstruction | Run | AirData) else "time (s)"

@@ -19,8 +19,9 @@ from flightmodel.airdata import pressure_pulse
 from flightmodel.checks import FloatArray, GateError
 from flightmodel.statistics import BAND_COLUMNS, chi_square_quantile, inside
 from flightmodel.tables import column_about
-from postflight.deflections import METHODS
+from postflight.deflections import METHODS, Deflections
 from postflight.plots.style import AXES, COLOUR, LABEL, RAW_AXES, drawn_unit, with_holes
+from postflight.plots.subject import flow_of
 from postflight.report.source import Rows, kept_rows, rounded
 from postflight.run_folder import answer_table, read_csv
 from postflight.runs import Run
@@ -171,6 +172,22 @@ def deflection_panel(run: Run) -> Panel | None:
         return None
     out = panel_of("deflection", "Deflection of the aeroshell against the centerbody", "deg", None, lines, dots)
     return out | {"ceiling": round(1.3 * max(max(x for x in one["y"] if x is not None) for one in lines), 2)}
+
+
+def flow_panels(answers: Deflections) -> list[Panel]:
+    """Angle of attack and dynamic pressure of the loads or trajectory that gave answers; none of a film alone."""
+    if not answers.knows_peak:
+        return []
+    flow = flow_of("report", answers)
+    rows = kept_rows([flow.alpha_total_wind_rad, flow.dynamic_pressure_pa], _TRAJECTORY_ROWS // 2)
+    t = rounded(flow.time_s[rows], 4)
+    pressure = line_of("dynamic pressure", flow.dynamic_pressure_pa[rows], None, _BLUE, [], 3) | {"t": t}
+    out = [panel_of("pressure", "Dynamic pressure", "Pa", None, [pressure], [])]
+    alpha, sd = np.rad2deg([flow.alpha_total_wind_rad[rows], flow.alpha_total_wind_sd_rad[rows]])
+    if np.isfinite(alpha).any():
+        angle = line_of("wind-relative", alpha, sd, _BLUE, [], 3) | {"t": t}
+        out.insert(0, panel_of("alpha", "Total angle of attack of the centerbody", "deg", None, [angle], []))
+    return out
 
 
 def drawn_answer(table: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:

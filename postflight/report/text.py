@@ -43,7 +43,9 @@ _NEAR_PEAK_S = 1.0  # window about the peak
 
 
 def date(utc: str) -> str:
-    """Day of a UTC time as it is read: ``17 August 2009``."""
+    """Day of a UTC time as it is read: ``17 August 2009``; empty where none is known."""
+    if not utc:
+        return ""
     day = parse_utc(utc)
     return f"{day.day} {day:%B %Y}"
 
@@ -75,11 +77,13 @@ def _answer(run: Run) -> str:
     highest = run.peak("altitude")
     if highest is not None and bool(highest["inside"]):
         return f"{run.telemetry.name}: apogee {pair(highest['value'] / 1e3, highest['sd'] / 1e3)}\u00a0km; {end}"
-    return f"{run.telemetry.name}: trajectory reconstructed; {end}"
+    return f"{run.telemetry.name}: {'trajectory reconstructed; ' if 'residuals' in run.tables else ''}{end}"
 
 
 def _peak_name(run: Run) -> str:
-    """Peak q, or the largest there is where the data end before the peak."""
+    """Peak q, or the largest there is where the data end before the peak; of a film alone the time of its answer."""
+    if "peak_dynamic_pressure_pa" not in run.summary:
+        return f"{run.peak_s:.2f} s"
     row = run.peak("dynamic pressure")
     return "peak q" if row is None or bool(row["inside"]) else "the largest q in the data"
 
@@ -87,23 +91,29 @@ def _peak_name(run: Run) -> str:
 def lead(run: Run) -> list[str]:
     """Sentences below the title."""
     s = run.summary
-    at = s["peak_dynamic_pressure_s"]
-    row = run.peak("dynamic pressure")
-    pressure = f"{s['peak_dynamic_pressure_pa']:.0f}"
-    if row is not None and np.isfinite(row["sd"]):
-        pressure = pair(s["peak_dynamic_pressure_pa"], row["sd"])
-    events = run.tables["events"]
-    there = events.iloc[int((events["t_s"] - at).abs().argmin())]
     out = [s["agreement"][0].upper() + s["agreement"][1:] + "."] if s["agreement"] else []
-    out.append(
-        f"{_peak_name(run).capitalize()}, the dynamic pressure: {pressure} Pa at {at:.2f} s "
-        f"({_utc(run, at)} UTC), Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
-    )
+    if "peak_dynamic_pressure_pa" in s:
+        out.append(_peak(run))
     out[0:0] = [words for words in (_oscillation(run), _outside_its_inputs(run)) if words]
     out.append(f"{s['verdicts_passed']} of {len(run.checks)} consistency checks pass.")
     if run.changes:
         out.insert(0, f"A what-if, not the flight as its folder states it: {'; '.join(run.changes)}.")
     return [f"{doubtful}.", *out] if (doubtful := _doubt(run)) else out
+
+
+def _peak(run: Run) -> str:
+    """Sentence on the peak of dynamic pressure."""
+    s, at, row = run.summary, run.peak_s, run.peak("dynamic pressure")
+    pressure = f"{s['peak_dynamic_pressure_pa']:.0f}"
+    if row is not None and np.isfinite(row["sd"]):
+        pressure = pair(s["peak_dynamic_pressure_pa"], row["sd"])
+    events = run.tables["events"]
+    there = events.iloc[int((events["t_s"] - at).abs().argmin())]
+    utc = f" ({_utc(run, at)} UTC)" if run.telemetry.t0_utc else ""
+    return (
+        f"{_peak_name(run).capitalize()}, the dynamic pressure: {pressure} Pa at {at:.2f} s{utc}, "
+        f"Mach {there['mach']:.2f}, {there['alt_m'] / 1e3:.1f} km."
+    )
 
 
 def rests_on(lines: Iterable[str]) -> list[list[str]]:

@@ -12,6 +12,7 @@ import base64
 import hashlib
 import json
 from collections.abc import Callable
+from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,9 @@ from markupsafe import Markup
 
 from flightmodel.airdata import pressure_pulse
 from flightmodel.config import parse_utc
+from flightmodel.events import has_peak
 from flightmodel.files import write_file, writing
+from postflight.deflections import Deflections
 from postflight.flight import Flight
 from postflight.plots.style import COLOUR, PAGE
 from postflight.report import text, view_3d
@@ -31,6 +34,7 @@ from postflight.report.panels import (
     NO_DEFLECTION,
     Panel,
     deflection_panel,
+    flow_panels,
     residual_panels,
     rigid_panels,
     study_panels,
@@ -38,6 +42,7 @@ from postflight.report.panels import (
     trajectory_rows,
 )
 from postflight.report.source import rounded
+from postflight.run_folder import method_summary, read_csv
 from postflight.runs import Run, read_run
 from postflight.scoring import Score, score_run
 
@@ -85,6 +90,80 @@ def write_report(
     has_truth = (flight_folder / "truth" / "truth.csv").is_file()
     write_whole(target, page(run, studies, score_run(flight_folder, run.path) if has_truth else None))
     return target
+
+
+def write_deflection_report(answers: Deflections, flight: Flight, folder: Path, settings: dict[str, Any]) -> None:
+    """Write the report of answers that no run holds into the folder of their tables.
+
+    Raises
+    ------
+    GateError
+        Where the file cannot be written.
+    """
+    run = _as_run(answers, flight, folder, settings)
+    frames, (findings, checks, extra) = _film(run)[0], _listed(run)
+    panels = [panel for panel in (deflection_panel(run), *flow_panels(answers)) if panel is not None]
+    span = [round(float(t), 3) for t in (run.table["t_s"].iloc[0], run.table["t_s"].iloc[-1])]
+    table, read, notes = flight.telemetry.loads, flight.read_loads, []
+    if table is not None and read is not None:
+        unused = ", ".join(read.unused)
+        notes = [f"Loads are those of {table.path.name}. Columns that are not used: {unused or 'none'}."]
+    found = {
+        "title": text.title(run),
+        "lead": text.lead(run),
+        "cards": [card for card in text.with_whiskers(text.cards(run)) if card["method"] in run.summary["methods"]],
+        "clock": text.clock_drawing(run),
+        "answers": text.table_rows(_answer_columns(answers)),
+        "assumed": assumed(run),
+        "date": text.date(run.telemetry.t0_utc),
+        "frames": frames,
+        "notes": notes,
+        "findings": findings,
+        "checks": checks,
+        "extra": extra,
+    }
+    shown = [{k: v for k, v in frame.items() if k != "jpeg"} for frame in frames]
+    data = charts(run, span, pulse_window(run.table), panels, frames=shown)
+    write_whole(folder / _NAME, rendered("deflection.html", data, run=run, **found))
+
+
+def _answer_columns(answers: Deflections) -> pd.DataFrame:
+    """One row a method, without what its card alone says."""
+    table = answers.to_frame().drop(columns=["reason", "theta_p16_deg", "theta_p50_deg", "theta_p84_deg"])
+    names = {str(name): str(name).replace("theta_", "deflection_").replace("_t_s", "_at_s") for name in table}
+    return table.rename(columns=names).dropna(axis=1, how="all")
+
+
+def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[str, Any]) -> Run:
+    """Answers with the tables of their folder, in the form that the parts of the report read."""
+    telemetry, checks = flight.telemetry, answers.consistency_checks
+    tables = {path.stem: read_csv(path) for path in sorted(folder.glob("*.csv"))}
+    times = [*(h.time_s for h in answers.histories.values()), *(film.time_s for film in telemetry.films.values())]
+    tables["bet"] = pd.DataFrame({"t_s": np.unique(np.concatenate(times or [np.zeros(1)]))})
+    at_s = answers.reference_s if np.isfinite(answers.reference_s) else float(tables["bet"]["t_s"][0])
+    tables["peaks"] = pd.DataFrame({"peak": [], "value": [], "sd": [], "inside": []})
+    tables["events"] = pd.DataFrame({"t_s": [], "event": []})
+    tables["findings"] = pd.DataFrame([f.as_row() for f in telemetry.findings], columns=["source", "what", "code"])
+    summary: dict[str, Any] = {
+        "methods": method_summary(answers, at_s),
+        "agreement": None if answers.fused is None else answers.fused.remark,
+        "peak_dynamic_pressure_s": at_s,
+        "verdicts_passed": sum(check.passed for check in checks),
+        "verdicts_failed": [f"{check.name}: {check.remark}" for check in checks if not check.passed],
+    }
+    if answers.knows_peak:
+        air = answers.loads if answers.bet is None else answers.bet.air
+        assert air is not None
+        columns = {"t_s": air.time_s, "alt_m": air.altitude_m, "mach": air.mach}
+        tables["bet"] = pd.DataFrame(columns | {"dynamic_pressure_pa": air.dynamic_pressure_pa})
+        columns |= {"value": air.dynamic_pressure_pa, "sd": air.dynamic_pressure_sd_pa}
+        at = {name: float(np.interp(at_s, air.time_s, column)) for name, column in columns.items()}
+        summary["peak_dynamic_pressure_pa"] = at["value"]
+        tables["events"] = pd.DataFrame([{"event": "peak dynamic pressure"} | at])
+        tables["peaks"] = pd.DataFrame([{"peak": "dynamic pressure", "inside": has_peak(air.dynamic_pressure_pa)} | at])
+    facts = {"settings": settings, "version": version("postflight"), "inputs_sha256": telemetry.hashes}
+    header = {"epoch_utc": telemetry.t0_utc, "assumed": flight.assumed}
+    return Run(folder, summary, facts, header, tables, flight)
 
 
 def write_whole(target: Path, content: str) -> None:
@@ -145,8 +224,8 @@ def rendered(template: str, data: dict[str, Any], **texts: Any) -> str:
     )
 
 
-def _texts(run: Run) -> dict[str, Any]:
-    """Everything on the page that is text or tables."""
+def _listed(run: Run) -> tuple[dict[str, Any], dict[str, Any], list[tuple[str, str, dict[str, Any]]]]:
+    """Findings, checks and further tables, each with title and, where it is a list, the file that holds it."""
     more = {
         "cameras": "Cameras: frames, and how far each one's own errors were found",
         "shell_shape": "Rocking or local deformation: the shell's shape under load, by video",
@@ -160,7 +239,22 @@ def _texts(run: Run) -> dict[str, Any]:
         "sensor_errors": "Estimated sensor errors",
         "peaks": "Peak values",
     }
-    checks, again = run.checks, run.tables.get("sensitivity")
+    checks = run.checks
+    return (
+        text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
+        text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
+        [
+            (title, f"{name}.csv" if name in text.LISTS else "", text.table_rows(text.main_columns(run.tables[name])))
+            for name, title in more.items()
+            if name in run.tables and len(run.tables[name])
+        ],
+    )
+
+
+def _texts(run: Run) -> dict[str, Any]:
+    """Everything on the page that is text or tables."""
+    findings, checks, extra = _listed(run)
+    again = run.tables.get("sensitivity")
     return {
         "title": text.title(run),
         "lead": text.lead(run),
@@ -168,13 +262,9 @@ def _texts(run: Run) -> dict[str, Any]:
         "clock": text.clock_drawing(run),
         "rests_on": text.rests_on(run.summary.get("rests_on") or []),  # runs of before have none
         "events": text.events(run),
-        "findings": text.table_rows(run.tables["findings"].astype({"source": str, "what": str})),
-        "checks": text.table_rows(checks.assign(passed=checks["passed"].map({True: "✓ pass", False: "✕ fail"}))),
-        "extra": [
-            (title, f"{name}.csv" if name in text.LISTS else "", text.table_rows(text.main_columns(run.tables[name])))
-            for name, title in more.items()
-            if name in run.tables
-        ],
+        "findings": findings,
+        "checks": checks,
+        "extra": extra,
         "sensitivity": text.sensitivity_rows(again) if again is not None else None,
         "vehicle": [(k, text.cell(v)) for k, v in (run.header["vehicle"] or {}).items()],
         "settings": [(k, text.cell(v)) for k, v in (run.header["settings"] | run.facts["settings"]).items()],
@@ -221,7 +311,7 @@ def charts(run: Run, span: list[float], first: list[float], panels: list[Panel],
     Only the report itself has columns of the trajectory (``bet``, ``rows``) and ``poses``.
     """
     data = {
-        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()),
+        "t0_ms": round(1e3 * parse_utc(run.header["epoch_utc"]).timestamp()) if run.header["epoch_utc"] else None,
         "span": span,
         "colours": PAGE | {"residual": COLOUR["estimate"]},
         "pulse": pulse_window(run.tables["bet"]),
@@ -236,8 +326,10 @@ def charts(run: Run, span: list[float], first: list[float], panels: list[Panel],
 
 
 def pulse_window(bet: pd.DataFrame) -> list[float]:
-    """From well before the pressure pulse to well after it, s."""
+    """From well before the pressure pulse to well after it, s; all that there is where no pressure is known."""
     t = bet["t_s"].to_numpy()
+    if "dynamic_pressure_pa" not in bet:
+        return [round(float(t[0]), 3), round(float(t[-1]), 3)]
     inside = t[pressure_pulse(bet["dynamic_pressure_pa"].to_numpy())]
     width = inside[-1] - inside[0]
     first, last = max(inside[0] - 0.75 * width, t[0]), min(inside[-1] + 0.5 * width, t[-1])

@@ -6,11 +6,13 @@ from types import SimpleNamespace
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
+import postflight as pf
 from flightmodel.film import film_frames
 from flightmodel.flightfolder import read_flight
-from postflight import filming
+from postflight import commands, filming
 from postflight.deflections import estimate
 from postflight.filming import camera_answer, orient_on_film
 from postflight.flight import read_flight as read_flown
@@ -18,6 +20,7 @@ from postflight.plots import run_figures
 from postflight.plots.style import FigureFolder
 from synthetic_flight.film import Imaging
 from tests.estimators.test_camera_deflection import film as rendered
+from tests.postflight.short_flights import write_pulse
 from tests.postflight.test_bad_input import names_line, refused
 from tests.refusing import numbers_in, printed_codes
 
@@ -251,3 +254,22 @@ def test_check_does_not_try_a_film_that_is_refused(filmed, command):
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
     assert "file-unreadable" in done.stdout + done.stderr
+
+
+def test_a_film_and_another_teams_table_are_fused(tmp_path, command):
+    """As with the trajectory that the table is of; the camera is not corrected by its moment, as without one."""
+    commands.simulate(str(write_pulse(tmp_path / "pulse.toml")), tmp_path / "flight", 5, force=False)
+    path = tmp_path / "flight" / "flight.toml"
+    bet = pf.reconstruct(pf.read_flight(tmp_path / "flight"))
+    direct = pf.fuse(bet)
+    bet.to_frame().to_csv(tmp_path / "flight" / "telemetry" / "bet.csv", index=False)
+    text = re.sub(r"(?ms)^\[(sensors|radars|attitude_prior|atmosphere)[^\]]*\]\n.*?(?=^\[|\Z)", "", path.read_text())
+    path.write_text(f'{text}\n[loads]\nfile = "telemetry/bet.csv"\n')
+    assert pf.check_flight(tmp_path / "flight").can_run.startswith("camera, misalignment, trim, fused")
+    assert command("deflection", tmp_path / "flight").returncode == 0
+    (written,) = (tmp_path / "flight" / "runs").iterdir()
+    answers = pd.read_csv(written / "answers.csv").set_index("method")
+    assert set(answers.index) == {"camera", "misalignment", "trim", "fused"}
+    at = answers.t_s["fused"]
+    assert abs(answers.theta_deg["fused"] - np.rad2deg(direct.history.angle_at(at)[0])) < answers.theta_sd_deg["fused"]
+    assert {"summary.png", "figure_2_3.png", "report.html"} <= {file.name for file in written.rglob("*.*")}

@@ -116,7 +116,10 @@ def test_the_command_writes_tables_and_figures_beside_the_pictures(filmed, comma
     assert done.returncode == 0, done.stderr
     written = {path.name for path in (filmed / "telemetry/camera5-deflection").rglob("*.*")}
     assert {"answers.csv", "deflection_camera.csv", "camera_frames.csv", "consistency_checks.csv"} <= written
-    assert {"deflection.png", "figure_2_3.png", "overlay.png"} <= written
+    assert {"deflection.png", "figure_2_3.png", "overlay.png", "report.html"} <= written
+    page = (filmed / "telemetry/camera5-deflection/report.html").read_text()
+    assert page.count("data:image/jpeg;base64,") >= 2
+    assert "by video alone" in page
     assert printed_codes(command(*alone).stderr) == ["name-unknown"]
     for words in (alone[:3], alone[:5], [*alone, filmed], ["deflection", "--film"]):
         assert command(*words).returncode == 2

@@ -39,6 +39,7 @@ TABLES = {
         "gnss.NAME": instruments.GnssEntry,
         "barometers.NAME": instruments.BarometerEntry,
         "atmosphere": instruments.AtmosphereEntry,
+        "loads": instruments.LoadsEntry,
         "frames": instruments.FramesEntry,
         "events": flightfolder.EventEntry,
     },

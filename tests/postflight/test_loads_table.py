@@ -1,6 +1,8 @@
 """Estimators on a table of another trajectory program: columns as they are written, and the answers of the run."""
 
 import re
+import shutil
+import tomllib
 
 import numpy as np
 import pandas as pd
@@ -17,6 +19,20 @@ from tests.refusing import refuses
 
 FOOT, PSF, G, KNOT = 0.3048, 47.88026, 9.80665, 1852.0 / 3600.0
 METHODS = ("misalignment", "trim")
+ANOTHER_TEAMS = {
+    "MET (ms)": lambda bet: 1e3 * bet.t_s,
+    "GEODETIC ALT (ft)": lambda bet: bet.alt_m / FOOT,
+    "MACH NO": lambda bet: bet.mach,
+    "QBAR (psf)": lambda bet: bet.dynamic_pressure_pa / PSF,
+    "TAS (kt)": lambda bet: bet.airspeed_mps / KNOT,
+    "AOA (deg)": lambda bet: bet.alpha_deg,
+    "SIDESLIP (deg)": lambda bet: bet.beta_deg,
+    **{f"{a} ACCEL (ft/s^2)": lambda bet, a=a: bet[f"a{a.lower()}_cg_mps2"] / FOOT for a in "XYZ"},
+    "ROLL RATE (rad/s)": lambda bet: np.deg2rad(bet.p_body_degps),
+    "PITCH RATE (rad/s)": lambda bet: np.deg2rad(bet.q_body_degps),
+    "YAW RATE (rad/s)": lambda bet: np.deg2rad(bet.r_body_degps),
+    "HEAT RATE": lambda bet: 0.0 * bet.t_s,
+}
 
 
 @pytest.fixture(scope="module")
@@ -170,3 +186,139 @@ def test_fusion_takes_loads(alien, run):
     at = frame.t_s["fused"]
     expected, stated = (np.interp(at, own.t_s, own[c]) for c in ("theta_deg", "theta_sd_deg"))
     assert abs(frame.theta_deg["fused"] - expected) < stated
+
+
+# a flight folder with [loads]
+
+
+@pytest.fixture
+def folder(tmp_path, bet, command):
+    """A flight folder into which a table of another team was imported."""
+    pd.DataFrame({name: column(bet) for name, column in ANOTHER_TEAMS.items()}).to_csv(
+        tmp_path / "post bet.txt", sep="\t", index=False
+    )
+    place = tmp_path / "flight"
+    assert command("init", place, "--vehicle", "irve2_reference").returncode == 0
+    done = command("import", tmp_path / "post bet.txt", "--into", place)
+    assert done.returncode == 0, done.stderr
+    assert "not used: HEAT RATE" in done.stdout
+    text = (place / "flight.toml").read_text()
+    assert "[barometers" not in text.replace("# [", "")
+    for key, value in (("name", "x"), ("t0_utc", "2009-08-17T12:52:00Z")):
+        text = text.replace(f'\n{key} = "FILL IN"', f'\n{key} = "{value}"')
+    (place / "flight.toml").write_text(text)
+    return place
+
+
+def test_another_teams_table_is_imported_checked_and_estimated_from(folder, alien, command):
+    stated = tomllib.loads((folder / "flight.toml").read_text())["loads"]
+    assert (stated["columns"]["altitude"]["unit"], stated["time"]["unit"]) == ("ft", "ms")
+    check = command("check", folder)
+    assert check.returncode == 0
+    assert check.stdout.startswith("can run: misalignment and trim from loads")
+    assert command("deflection", folder).returncode == 0
+    (written,) = (folder / "runs").iterdir()
+    answers = pd.read_csv(written / "answers.csv").set_index("method")
+    direct = pf.fuse(read_loads(alien, "irve2_reference")).to_frame().set_index("method")
+    for method in (*METHODS, "fused"):
+        assert abs(answers.theta_deg[method] - direct.theta_deg[method]) < 0.1 * direct.theta_sd_deg[method]
+        assert abs(answers.theta_sd_deg[method] / direct.theta_sd_deg[method] - 1.0) < 0.05
+    page = (written / "report.html").read_text()
+    assert 'http-equiv="Content-Security-Policy"' in page
+    assert f"{answers.theta_deg['fused']:.2f}" in page
+    assert "flow_angle_sd_deg = 0.3" in page
+    assert "HEAT RATE" in page
+
+
+def test_a_flight_with_loads_is_estimated_from_and_not_reconstructed(folder):
+    flight = pf.read_flight(folder)
+    fused = pf.fuse(flight)
+    assert set(fused) == {*METHODS, "fused"}
+    wide = pf.estimate_misalignment(flight.with_(flow_angle_sd_deg=1.5))
+    assert wide.angle_at(fused.reference_s)[1] > 1.1 * fused["misalignment"].angle_at(fused.reference_s)[1]
+    stiffer = pf.estimate_trim(flight.with_(c_m=1.2))
+    assert abs(stiffer.at(fused.reference_s).theta_deg - fused["trim"].at(fused.reference_s).theta_deg) > 0.1
+    with refuses("tracker-missing"):
+        pf.reconstruct(flight)
+    with refuses("name-unknown"):
+        flight.with_(wind=None)
+
+
+def test_run_of_a_flight_with_loads_is_its_deflection(folder, command):
+    assert command("run", folder, "--set", "c_n=1.05", "--name", "stiff").returncode == 0
+    (written,) = (folder / "runs").iterdir()
+    assert written.name.endswith("-stiff")
+    assert "c_n = 1.05" in (written / "report.html").read_text()
+    assert command("reconstruct", folder).returncode == 3
+
+
+def test_what_a_flights_table_lacks_is_refused_by_the_reader_and_the_check(folder):
+    table = folder / tomllib.loads((folder / "flight.toml").read_text())["loads"]["file"]
+    table.write_text(table.read_text().replace("SIDESLIP", "SIDE FORCE"))
+    with refuses("column-missing"):
+        pf.read_flight(folder)
+    report = pf.check_flight(folder)
+    assert (report.exit_code, {fault.code for fault in report.refused}) == (3, {"column-missing"})
+    table.unlink()
+    with refuses("file-missing"):
+        pf.read_flight(folder)
+
+
+def test_loads_beside_trackers_are_refused_and_proposed_as_a_comment(folder, run, tmp_path, command):
+    text = (folder / "flight.toml").read_text()
+    other = run.parents[1]
+    for name in ("telemetry", "truth"):
+        shutil.copytree(other / name, tmp_path / "both" / name)
+    with_radars = (other / "flight.toml").read_text()
+    (tmp_path / "both" / "flight.toml").write_text(with_radars)
+    assert command("import", tmp_path / "post bet.txt", "--into", tmp_path / "both").returncode == 3
+    assert tomllib.loads((tmp_path / "both" / "flight.toml").read_text()) == tomllib.loads(with_radars)
+    (tmp_path / "both" / "flight.toml").write_text(with_radars + text[text.index("\n[loads]") :])
+    with refuses("keys-conflict"):
+        pf.read_flight(tmp_path / "both")
+
+
+def test_columns_of_no_known_quantity_are_refused(alien):
+    with refuses("key-unknown", names=["altitude"]):
+        read_loads(alien, "irve2_reference", columns={"altitud": "ALT (kft)"})
+
+
+def test_clock_times_count_from_the_flights_time_zero(folder):
+    path = folder / "flight.toml"
+    table = folder / tomllib.loads(path.read_text())["loads"]["file"]
+    flown = pd.read_csv(table)
+    direct = pf.read_flight(folder).loads
+    clock = pd.Timestamp("2009-08-17T12:52:00") + pd.to_timedelta(flown.pop("MET (ms)"), unit="ms")
+    flown.insert(0, "GMT", clock.dt.strftime("%j:%H:%M:%S.%f"))
+    flown.to_csv(table, index=False)
+    time = 'time = { column = "GMT", format = "irig_doy", offset_s = 2.0 }'
+    path.write_text(re.sub(r"(?m)^time = \{.*$", time, path.read_text()))
+    loads = pf.read_flight(folder).loads
+    assert abs(loads.time_s[0] - 2.0 - direct.time_s[0]) < 0.051  # on a grid of 20 Hz
+    assert loads.dynamic_pressure_pa.max() == pytest.approx(direct.dynamic_pressure_pa.max(), rel=1e-4)
+    table.write_text(table.read_text().replace(":12:59:", ":12.59.", 1))
+    with refuses("time-format"):
+        pf.read_flight(folder)
+
+
+def test_errors_that_the_table_states_are_not_assumed(folder, run, bet):
+    own = folder / "telemetry" / "own.csv"
+    shutil.copy(run / "bet.csv", own)
+    text = (folder / "flight.toml").read_text()
+    stated = '[loads]\nfile = "telemetry/own.csv"\nuse_s = [[420.0, 450.0]]\nrate_scale_sd = 0.001\n'
+    (folder / "flight.toml").write_text(text[: text.index("\n[loads]")] + f"\n{stated}")
+    flight = pf.read_flight(folder)
+    assert not {"flow_angle_sd_deg", "dynamic_pressure_sd_percent", "rate_scale_sd"} & set(flight.assumed["loads"])
+    assert "time_bias_sd_s" in flight.assumed["loads"]
+    assert flight.loads.time_s[0] >= 420.0
+    assert flight.loads.time_s[-1] <= 450.0
+    assert pf.check_flight(folder).assumed["loads"] == flight.assumed["loads"]
+
+
+def test_the_report_of_a_table_that_ends_before_the_peak_says_so(alien, bet, tmp_path, command):
+    alien[(bet.dynamic_pressure_pa < 900.0) & (bet.t_s < bet.t_s[bet.dynamic_pressure_pa.idxmax()])].to_csv(
+        tmp_path / "rise.csv", index=False
+    )
+    assert command("deflection", "--loads", tmp_path / "rise.csv", "--vehicle", "irve2_reference").returncode == 0
+    page = (tmp_path / "rise-deflection" / "report.html").read_text()
+    assert "the largest q in the data" in page

@@ -94,7 +94,7 @@ function axes(withUtc, small) {
   const digits = (splits) => [0, 1, 2, 3].find((d) => splits.every((t) => Math.abs(t - t.toFixed(d)) < 1e-6)) ?? 3;
   return [
     { ...look, size: withUtc ? 46 : 30, space: withUtc ? 90 : 60, gap: 4,
-      values: (u, splits) => splits.map((t) => `${t.toFixed(digits(splits))} s` + (withUtc ? `\n${utcWords(t)}` : "")) },
+      values: (u, splits) => splits.map((t) => `${t.toFixed(digits(splits))} s` + (withUtc && data.t0_ms !== null ? `\n${utcWords(t)}` : "")) },
     { ...look, size: GUTTER, gap: 6, space: small ? 18 : 28 },
   ];
 }

@@ -95,7 +95,7 @@ function startControls() {
   slider.addEventListener("keydown", clock.key);
   clock.onCursor.push((t) => {
     slider.value = t;
-    const reading = `${t.toFixed(2)} s   ${utcWords(t, 2)} UTC`;
+    const reading = `${t.toFixed(2)} s` + (data.t0_ms === null ? "" : `   ${utcWords(t, 2)} UTC`);
     words.textContent = reading;
     slider.setAttribute("aria-valuetext", reading);
   });
