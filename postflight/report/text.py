@@ -159,11 +159,13 @@ def _oscillation(run: Run) -> str:
 
 
 def _outside_its_inputs(run: Run) -> str:
-    """Sentence on a fused angle beyond those of all methods, and why; empty where it lies among them."""
+    """Sentence on a fused angle more than its sd beyond those of all methods, and why; else empty."""
     methods = run.summary["methods"]
     answers = {name: angle for name, m in methods.items() if (angle := m["deflection_deg"]) is not None}
     fused = answers.pop("fused", None)
-    if fused is None or len(answers) < 2 or min(answers.values()) <= fused <= max(answers.values()):
+    if fused is None or len(answers) < 2:
+        return ""
+    if min(answers.values()) - fused <= (sd := methods["fused"]["sd_deg"]) and fused - max(answers.values()) <= sd:
         return ""
     side = "above" if fused > max(answers.values()) else "below"
     words = f"The fused angle is {side} that of every method: it is no mean at one instant, but what explains all "

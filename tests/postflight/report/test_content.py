@@ -202,11 +202,12 @@ def test_a_fused_angle_beyond_its_inputs_says_why(run) -> None:
         methods[name]["deflection_deg"] = angle
     among = replace(run, summary=run.summary | {"methods": methods})
     methods = {name: dict(answer) for name, answer in methods.items()}
-    methods["fused"]["deflection_deg"] = 3.5
-    above = replace(run, summary=run.summary | {"methods": methods})
-    said = [words for words in texts.lead(above) if words not in texts.lead(among)]
     inputs = run.tables["fusion_inputs"]
-    assert any(inputs["input"][inputs["moved_sd"].abs().idxmax()] in words for words in said)
+    for sds, asked in ((0.9, False), (1.1, True)):  # within its sd nobody asks
+        methods["fused"]["deflection_deg"] = 3.4 + sds * methods["fused"]["sd_deg"]
+        above = replace(run, summary=run.summary | {"methods": methods})
+        said = [words for words in texts.lead(above) if words not in texts.lead(among)]
+        assert any(inputs["input"][inputs["moved_sd"].abs().idxmax()] in words for words in said) == asked
 
 
 @pytest.mark.parametrize(
