@@ -11,6 +11,7 @@ import click
 import pytest
 from pydantic import BaseModel
 
+import postflight
 from flightmodel import aerodynamics, tables
 from postflight import plots
 from postflight.cli import cli
@@ -129,6 +130,12 @@ def test_the_gallery_has_every_figure_and_no_other_picture():
     assert [name for name in plots.__all__ if name.startswith("figure_") and name not in page] == []
     shown = set(re.findall(r"\]\(images/gallery/(\S+)\)", page))
     assert shown == {path.name for path in (DOCS / "images" / "gallery").iterdir()}
+
+
+def test_the_page_of_the_interface_has_every_public_name_once():
+    """docs/site_hooks.py puts the docstrings of these names in place of the lines."""
+    lines = re.findall(r"^Names: (.*)\.$", (DOCS / "interface.md").read_text(), re.MULTILINE)
+    assert sorted(name for line in lines for name in re.findall(r"`(\w+)`", line)) == sorted(postflight.__all__)
 
 
 def message_codes() -> ModuleType:
