@@ -35,8 +35,9 @@ lint: $(VENV)/installed-dev
 	$(BIN)/lint-imports
 
 # the documentation as a site that needs no network: site/index.html, with a report and the notebooks' output;
-# the demo's flight and the notebooks that need none are made side by side
+# kernels first, as above; then the demo's flight and the notebooks that need none are made side by side
 docs: $(VENV)/installed-docs
+	$(BIN)/postflight warmup
 	$(MAKE) --no-print-directory --jobs 2 demo-flight/demo.png $(NOTEBOOKS)
 	$(BIN)/python -m mkdocs build --strict
 

@@ -155,6 +155,16 @@ def test_page_of_codes_has_every_code_that_a_call_states():
     assert not stated - set(listed)
 
 
+def test_every_code_has_a_remedy_from_one_place():
+    """From the program's own words, or else from the list: which can hold no code whose message has come to say it."""
+    module = message_codes()
+    codes, program, listed = set(module.message_codes()), set(module.said_by_the_program()), module.unsaid()
+    assert set(listed) == codes - program
+    assert all(text.endswith(".") for text in listed.values())
+    assert len(program) > 100
+    assert module.remedies()["time-backwards"] == "sort the rows or remove the duplicates"
+
+
 A_CODE_OF_WORDS = re.compile(r'"([a-z][a-z0-9]*(?:-[a-z0-9]+)+)"')
 
 
