@@ -180,7 +180,7 @@ def camera():
         line(ax, lens, 1.15 * np.array([-np.cos(lean + off), -np.sin(lean + off)]), color=COLOUR["camera"], ls=style)
     ax.plot(*lens, "s", color=COLOUR["camera"], ms=7, zorder=7)
     says(ax, np.add(lens, [0.2, -0.2]), "camera", COLOUR["camera"])
-    named(ax, turned([[0.79, -1.36]], THETA)[0], (0.2, -1.45), "the rim has moved\ntowards the camera")
+    named(ax, turned([[0.79, -1.36]], THETA)[0], (0.05, -1.45), "the rim has moved\ntowards the camera")
     view = camera_from_mount(mount)
     clocks = np.deg2rad(mount.clock_lv_deg + np.linspace(-80.0, 80.0, 161))
     eye = view.position_body_m
