@@ -5,7 +5,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # two processes; threads of linear algebra in each would only get in each other's way
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -q
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -q
 
 # each command reads byte code then, also where Python is told to write none: a third of a second
 COMPILED := $(BIN)/python -m compileall -q flightmodel recon estimators synthetic_flight postflight
@@ -33,14 +34,23 @@ lint: $(VENV)/installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# the documentation as a site that needs no network: site/index.html, with a report and the notebooks' output
-docs: $(VENV)/installed-docs build/notebooks/made
+# the documentation as a site that needs no network: site/index.html, with a report and the notebooks' output;
+# kernels first, as above; then the demo's flight and the notebooks that need none are made side by side
+docs: $(VENV)/installed-docs
+	$(BIN)/postflight warmup
+	$(MAKE) --no-print-directory --jobs 2 demo-flight/demo.png $(NOTEBOOKS)
 	$(BIN)/python -m mkdocs build --strict
 
-build/notebooks/made: notebooks/*.ipynb | $(VENV)/installed-docs
-	test -d demo-flight || $(BIN)/postflight demo demo-flight
-	$(BIN)/python -m nbconvert --to notebook --execute --output-dir build/notebooks notebooks/*.ipynb
-	touch $@
+NOTEBOOKS := $(addprefix build/,$(wildcard notebooks/*.ipynb))
+OF_THE_DEMO := $(addprefix build/notebooks/,deflection_by_video.ipynb one_flight.ipynb three_methods_one_answer.ipynb)
+
+demo-flight/demo.png: | $(VENV)/installed-docs
+	$(ONE_THREAD) $(BIN)/postflight demo demo-flight
+
+$(OF_THE_DEMO): | demo-flight/demo.png
+
+build/notebooks/%.ipynb: notebooks/%.ipynb | $(VENV)/installed-docs
+	$(ONE_THREAD) $(BIN)/python -m nbconvert --to notebook --execute --output-dir build/notebooks $<
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

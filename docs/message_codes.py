@@ -1,18 +1,31 @@
-"""Which stable codes does the program print, and what does each message say?
+"""Which stable codes does the program print, what does each message say, and what is to be done?
 
 Read from the source: every call that makes a refusal, a finding or a consistency check with a code, and every other
 text that looks like a code and is not among `NO_CODES`: one that comes by way of a variable. Values and names in a
-message are shown as dots. ``python docs/message_codes.py`` prints the page.
+message are shown as dots. A remedy is the advice of a consistency check or the clause of a message that begins with an
+instruction; ``docs/remedies.csv`` has those of the codes whose message has none, and no others. ``python
+docs/message_codes.py`` prints the page.
 """
 
 import ast
+import csv
 import re
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("flightmodel", "recon", "estimators", "synthetic_flight", "postflight")
 A_CODE = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 OPEN = "..."
+# a message's clause that begins with one of these says what to do
+INSTRUCTION = re.compile(
+    r"(?:^|[:;,.?] (?:or |and |else |then |so |otherwise )?)((?:"
+    "add|allow|calibrate|change|check|choose|close|compare|convert|copy|correct|cut|declare|deinterlace|delete|deliver|"
+    "extract|fill|fit|fix|give|install|inspect|keep|leave|list|load|lower|make|mask|mend|move|name|note|put|raise|read|"
+    "remove|rename|repeat|replace|restore|run|save|say|set|shorten|sort|split|start|state|swap|tabulate|take|transform|"
+    "try|unpack|use|widen|write) .*)",
+    re.IGNORECASE,
+)
 # of a call: which argument is the code, which the words
 CALLS = {
     **dict.fromkeys(("GateError", "ConfigError", "DivergenceError", "TableRangeError"), (1, 0)),
@@ -118,10 +131,12 @@ def codes_by_name(tree: ast.Module) -> dict[str, str]:
     return out
 
 
-def message_codes() -> dict[str, str]:
-    """Words of every code; of several messages with one code, the one of which most is known."""
+@cache
+def _messages() -> tuple[dict[str, str], dict[str, str]]:
+    """Words of every code, and the advice that a consistency check adds to them: of several, the longest known."""
     out: dict[str, str] = {}
     by_name: dict[str, str] = {}
+    advised: dict[str, str] = {}
     for path in sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for code, text in codes_by_name(tree).items():
@@ -135,24 +150,65 @@ def message_codes() -> dict[str, str]:
             code, words = given.get("code", given.get(at_code)), given.get(at_words, given.get("words", given.get(1)))
             if name not in CALLS or code is None or words is None:
                 continue
-            text = " ".join(re.sub(r"(\.\.\.[ ,;:']*){2,}", f"{OPEN} ", words_of(words, known)).split())
             for each in codes_of(code, known):
-                out[each] = max(out.get(each, ""), text, key=said)
-    return dict(sorted((by_name | out).items()))
+                out[each] = max(out.get(each, ""), _joined(words, known), key=said)
+                if "advice" in given:
+                    advised[each] = max(advised.get(each, ""), _joined(given["advice"], known), key=said)
+    return dict(sorted((by_name | out).items())), advised
+
+
+def _joined(words: ast.expr, known: Known) -> str:
+    return " ".join(re.sub(r"(\.\.\.[ ,;:']*){2,}", f"{OPEN} ", words_of(words, known)).split())
+
+
+def message_codes() -> dict[str, str]:
+    """Words of every code; of several messages with one code, the one of which most is known."""
+    return _messages()[0]
+
+
+def remedies() -> dict[str, str]:
+    """What to do about every code: the program's own words, else those of ``docs/remedies.csv``."""
+    return unsaid() | said_by_the_program()
+
+
+def said_by_the_program() -> dict[str, str]:
+    """Remedies that stand in the messages: a check's advice, or the clause that begins with an instruction."""
+    words, advised = _messages()
+    found = {code: match[1] for code, text in words.items() if (match := INSTRUCTION.search(text))}
+    return found | {code: text for code, text in advised.items() if said(text) > 10}
+
+
+def unsaid() -> dict[str, str]:
+    """Remedies of the codes whose message has none, from ``docs/remedies.csv``."""
+    with (Path(__file__).parent / "remedies.csv").open(encoding="utf-8", newline="") as lines:
+        return {row["code"]: row["what_to_do"] for row in csv.DictReader(lines)}
 
 
 def page() -> str:
     """The page of all codes."""
+    todo = remedies()
     rows = [
-        f"| `{code}` | {(text or OPEN).replace('|', '/').replace('<', '&lt;')} |"
-        for code, text in message_codes().items()
+        f"| `{code}` | {_cell(text, todo[code])} | {_sentence(todo[code])} |" for code, text in message_codes().items()
     ]
     head = (
-        "# Message codes\n\nEvery refusal, finding and consistency check: its stable code, and what its message says "
-        f"(`{OPEN}`: a name, place or value of the case at hand). Made from the source.\n\n"
-        "| code | message |\n|---|---|\n"
+        "# Message codes\n\nThis page lists every refusal, finding and consistency check with its stable code, its "
+        f"message, and its cause or remedy. `{OPEN}` stands for a name, place or value of the case at hand. The page "
+        "is made from the source.\n\n| code | message | cause or remedy |\n|---|---|---|\n"
     )
     return head + "\n".join(rows) + "\n"
+
+
+def _cell(text: str, remedy: str) -> str:
+    """A message without markup and without the remedy, which the next cell has."""
+    return _shown(re.sub(r"\[/?(?:red|yellow|green)?\]", "", text).removesuffix(remedy).rstrip(" :;,.")) or OPEN
+
+
+def _sentence(text: str) -> str:
+    return _shown(text[:1].upper() + text[1:].rstrip(".")) + "."
+
+
+def _shown(text: str) -> str:
+    return text.replace("|", "/").replace("<", "&lt;")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,14 @@ site: such a link becomes its words. Forms of files are pages as they are; messa
 
 import csv
 import html
+import json
 import re
 from pathlib import Path
 
 import message_codes  # beside this file
 import nbformat
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
@@ -25,21 +27,28 @@ FORMS = {
     "flight-keys.md": ("flight.toml", "postflight/intake/templates/flight.toml"),
     "vehicle-keys.md": ("a vehicle file", "postflight/intake/templates/vehicle.toml"),
 }
+DEMO = ("irve2_reference", 0)  # scenario and seed of `postflight demo`
+INTERFACE = "interface.md"
 CASES = "docs/wrong_inputs.csv"
 MADE = {source: page for page, source in BESIDE.items()} | {source: page for page, (_, source) in FORMS.items()}
 MADE |= {CASES: "wrong-input-cases.md", "docs/message_codes.py": "message-codes.md"}
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
 
 
-def reference():
-    """The page of the public interface, made from its docstrings: conventions, then every name."""
+def with_docstrings(markdown):
+    """The page of the public interface: a line ``Names: `a`, `b`.`` becomes the docstrings of these names."""
     import postflight
     from postflight import plots
 
-    names = [f"## {name}\n\n::: {postflight._DOOR[name]}.{name}\n" for name in postflight.__all__ if name != "plots"]
-    figures = [f"### {name}\n\n::: postflight.plots.{plots._MODULE[name]}.{name}\n" for name in plots.__all__]
-    text = "\n".join([*names, f"## plots\n\n{plots.__doc__}", *figures])
-    return f"# The public interface\n\n```text\n{postflight.__doc__.strip()}\n```\n\n{text}"
+    def entry(name):
+        return f"::: {postflight._DOOR[name]}.{name}\n"
+
+    def described(match):
+        return "\n".join(entry(name) for name in re.findall(r"`(\w+)`", match[1]) if name != "plots")
+
+    figures = [f"::: postflight.plots.{plots._MODULE[name]}.{name}\n" for name in plots.__all__]
+    text = re.sub(r"^Names: (.*)$", described, markdown, flags=re.MULTILINE)
+    return "\n".join([text, "## Every figure\n", plots.__doc__, "", *figures])
 
 
 def notebook(name):
@@ -55,15 +64,20 @@ def notebook(name):
 
 
 def sample_report():
-    """Page with the demo's report, as any run writes it, and the report itself."""
+    """Page with the report of the demo's own flight, without a changed assumption, and the report itself."""
+    from postflight.runs import find_run
+
     words = "# A sample report\n\nThe report of [the demo](tutorial-demo.md)'s flight, which is synthetic"
-    reports = sorted((ROOT / "demo-flight/runs").glob("2*/report.html"))
-    if not reports:
+    demo = ROOT / "demo-flight"
+    if not (demo / "demo.png").exists():
         return {"sample-report.md": f"{words}. Not made here: `make docs` makes it.\n"}
+    flown = json.loads((demo / "truth/run.json").read_text(encoding="utf-8"))
+    if (flown["scenario"], flown["seed"]) != DEMO:
+        raise PluginError(f"demo-flight is {flown['scenario']}, seed {flown['seed']}, and not the demo: remove it")
     style = "width: 100%; height: 80vh; border: 1px solid"
     frame = f'<iframe src="demo-report.html" title="report of the demo" style="{style}"></iframe>'
     text = f'{words}: <a href="demo-report.html">on a page of its own</a>, or here.\n\n{frame}\n'
-    return {"sample-report.md": text, "demo-report.html": reports[-1].read_bytes()}
+    return {"sample-report.md": text, "demo-report.html": (find_run(demo, "plain") / "report.html").read_bytes()}
 
 
 def table(path):
@@ -81,7 +95,6 @@ def on_files(files, config):
         files.append(File.generated(config, page, content=content))
     files.append(File.generated(config, "message-codes.md", content=message_codes.page()))
     files.append(File.generated(config, MADE[CASES], content=f"# Cases of wrong inputs\n\n{table(ROOT / CASES)}\n"))
-    files.append(File.generated(config, "reference/postflight.md", content=reference()))
     for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
         for name, content in notebook(path.stem).items():
             files.append(File.generated(config, f"notebooks/{name}", content=content))
@@ -95,6 +108,8 @@ def on_files(files, config):
 
 def on_page_markdown(markdown, page, config, files):
     """Links that leave the pages become what they lead to within the site, or their words alone."""
+    if page.file.src_uri == INTERFACE:
+        markdown = with_docstrings(markdown)
     home = Path(BESIDE.get(page.file.src_uri, f"docs/{page.file.src_uri}")).parent
 
     def lead(match):

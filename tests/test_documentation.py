@@ -11,6 +11,7 @@ import click
 import pytest
 from pydantic import BaseModel
 
+import postflight
 from flightmodel import aerodynamics, tables
 from postflight import plots
 from postflight.cli import cli
@@ -131,6 +132,12 @@ def test_the_gallery_has_every_figure_and_no_other_picture():
     assert shown == {path.name for path in (DOCS / "images" / "gallery").iterdir()}
 
 
+def test_the_page_of_the_interface_has_every_public_name_once():
+    """docs/site_hooks.py puts the docstrings of these names in place of the lines."""
+    lines = re.findall(r"^Names: (.*)\.$", (DOCS / "interface.md").read_text(), re.MULTILINE)
+    assert sorted(name for line in lines for name in re.findall(r"`(\w+)`", line)) == sorted(postflight.__all__)
+
+
 def message_codes() -> ModuleType:
     spec = importlib.util.spec_from_file_location("message_codes", DOCS / "message_codes.py")
     module = importlib.util.module_from_spec(spec)
@@ -146,6 +153,16 @@ def test_page_of_codes_has_every_code_that_a_call_states():
         stated |= {w.value.value for w in words if w.arg == "code" and isinstance(w.value, ast.Constant)}
     assert len(stated) > 60
     assert not stated - set(listed)
+
+
+def test_every_code_has_a_remedy_from_one_place():
+    """From the program's own words, or else from the list: which can hold no code whose message has come to say it."""
+    module = message_codes()
+    codes, program, listed = set(module.message_codes()), set(module.said_by_the_program()), module.unsaid()
+    assert set(listed) == codes - program
+    assert all(text.endswith(".") for text in listed.values())
+    assert len(program) > 100
+    assert module.remedies()["time-backwards"] == "sort the rows or remove the duplicates"
 
 
 A_CODE_OF_WORDS = re.compile(r'"([a-z][a-z0-9]*(?:-[a-z0-9]+)+)"')

@@ -39,7 +39,7 @@ def test_site_is_whole_and_asks_for_nothing(site):
         assert not asked, f"{name} loads something from elsewhere"
         assert not re.search(r'class="arithmatex"', text), f"{name} has a formula that is not drawn"
     assert "<math" in pages["derivations.html"]
-    assert "estimate_misalignment" in pages["reference/postflight.html"]
+    assert "estimate_misalignment" in pages["interface.html"]
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         assert f"notebooks/{notebook.stem}.html" in pages
 
