@@ -115,7 +115,11 @@ def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
     if wanted is not None and str(wanted) not in (PLAIN, *named) and Path(wanted).is_dir():
         return _whole(flight_folder, Path(wanted))
     if not runs:
+        alone = sorted((flight_folder / "runs").glob("*/answers.csv"))
         words = f"{flight_folder}: no complete run; use `postflight run {flight_folder}` first"
+        if alone:
+            words = f"{flight_folder}: no complete run: {alone[-1].parent} holds a deflection (its report.html) and "
+            words += "no trajectory, which `postflight run` makes of a flight with trackers"
         raise GateError(words, "run-missing")
     if wanted is None:
         return runs[-1]

@@ -250,6 +250,10 @@ def test_run_of_a_flight_with_loads_is_its_deflection(folder, command):
     assert written.name.endswith("-stiff")
     assert "c_n = 1.05" in (written / "report.html").read_text()
     assert command("reconstruct", folder).returncode == 3
+    for reader in ("report", "export"):
+        done = command(reader, folder, *(["--to", "csv"] if reader == "export" else []))
+        assert done.returncode == 3
+        assert f"{written} holds a deflection" in done.stdout + done.stderr
 
 
 def test_what_a_flights_table_lacks_is_refused_by_the_reader_and_the_check(folder):
