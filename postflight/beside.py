@@ -53,7 +53,7 @@ def worker_pool(workers: int, start: str = "spawn") -> Iterator[ProcessPoolExecu
                 os.environ[name] = value
 
 
-def _start() -> str:
+def start_method() -> str:
     """Return how a process starts: a fork where this thread is the only one, since a fork copies locks of others.
 
     A fork has what this process loaded, which takes longer to load than a film to read.
@@ -109,7 +109,7 @@ class Beside:
 
     def __init__(self) -> None:
         self._ending = contextlib.ExitStack()
-        self._pool = self._ending.enter_context(worker_pool(1, _start()))
+        self._pool = self._ending.enter_context(worker_pool(1, start_method()))
         self._numbers = count()
 
     def __enter__(self) -> Beside:

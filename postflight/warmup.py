@@ -24,7 +24,7 @@ from flightmodel import earth
 from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
-from postflight.beside import worker_pool
+from postflight.beside import start_method, worker_pool
 from recon import ekf, propagation, smoother
 from recon.ekf import Problem, observe
 from recon.measurements import Instrument
@@ -217,7 +217,7 @@ def prepare(groups: Iterable[str], report: Progress) -> dict[str, str]:
     if not shares:
         return {}
     failed: dict[str, str] = {}
-    with worker_pool(min(len(shares), len(os.sched_getaffinity(0)))) as pool:
+    with worker_pool(min(len(shares), len(os.sched_getaffinity(0))), start_method()) as pool:
         running = {pool.submit(_compile, share): share for share in shares}
         watch, waiting = _Watch(shares), set(running)
         while waiting:
