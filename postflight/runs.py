@@ -116,10 +116,8 @@ def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
         return _whole(flight_folder, Path(wanted))
     if not runs:
         alone = sorted((flight_folder / "runs").glob("*/answers.csv"))
-        words = f"{flight_folder}: no complete run; use `postflight run {flight_folder}` first"
-        if alone:
-            words = f"{flight_folder}: no complete run: {alone[-1].parent} holds a deflection (its report.html) and "
-            words += "no trajectory, which `postflight run` makes of a flight with trackers"
+        holds = f" ({alone[-1].parent} holds a deflection, and no trajectory, which needs trackers)" if alone else ""
+        words = f"{flight_folder}: no complete run{holds}; use `postflight run {flight_folder}` first"
         raise GateError(words, "run-missing")
     if wanted is None:
         return runs[-1]
