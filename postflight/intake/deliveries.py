@@ -1,8 +1,9 @@
 """What becomes of each delivered file: a telemetry table, a radiosonde, coefficients, video, or nothing?
 
 ``postflight import`` reads all files, proposes what each column is, and only then writes: tables to ``telemetry/`` as
-CSV, images and films there as they are, coefficient tables beside the vehicle file with a sidecar to fill in, and the
-proposals at the end of flight.toml. Nothing is overwritten, and nothing is written where a file is refused.
+CSV, images and films there as they are, a vehicle file with its tables to ``vehicle/``, coefficient tables beside it
+with a sidecar to fill in, and the proposals at the end of flight.toml. Nothing is overwritten, and nothing is written
+where a file is refused.
 
 A radiosonde's density follows from its pressure, temperature and humidity, ``rho = p / (R T_v)`` with the virtual
 temperature ``T_v = T / (1 - 0.378 e / p)`` and the vapour pressure ``e`` of the dew point (Bolton, "The computation
@@ -52,7 +53,14 @@ from postflight.intake.column_recognition import (
     column_unit,
     find_time,
 )
-from postflight.intake.flight_form import placeholders, section_text, start_text, template
+from postflight.intake.flight_form import (
+    placeholders,
+    section_text,
+    start_text,
+    template,
+    vehicle_copies,
+    with_vehicle,
+)
 from postflight.intake.freeform_tables import FreeFormTable
 from postflight.intake.headers import MARKS, fold, parse_column_name
 from postflight.intake.loads_columns import loads_proposal
@@ -382,6 +390,7 @@ class _Delivery:
     videos: list[Video] = field(default_factory=list)
     daveml: dict[Path, bytes] = field(default_factory=dict)
     files: dict[Path, bytes | str] = field(default_factory=dict)
+    vehicles: list[str] = field(default_factory=list)
     vehicle: dict[Path, str] = field(default_factory=dict)
     skipped: list[Issue] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -421,6 +430,8 @@ def import_files(files: tuple[Path, ...], folder: Path) -> None:
         raise ConfigError([f"{p}: {words}" for p in there], code="file-exists")
     added, shown, unused = _proposals(came, places, folder, tables)
     text = path.read_text(encoding="utf-8-sig").rstrip() + "\n" + added
+    for named in came.vehicles if "vehicle" not in tables else ():
+        text = with_vehicle(text, named)
     tomllib.loads(text)  # what is written can be read
     for video in came.videos:
         _copy(video)
@@ -456,7 +467,16 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     came = _Delivery()
     faults: list[str] = []
     lacking: list[str] = []  # libraries that are not installed
-    for file in files:
+    other: dict[str, Issue] = {}
+    for file in (file for file in files if file.suffix.lower() == ".toml"):
+        try:
+            came.files |= {place: _bytes_of(source) for place, source in vehicle_copies(folder, file).items()}
+            came.vehicles.append(f"vehicle/{file.name}")
+        except ConfigError as no_vehicle:
+            other[file.name] = no_vehicle.faults[0]
+    with_it = {place.name for place in came.files}  # a vehicle's own tables, delivered beside it
+    came.skipped += [fault for name, fault in other.items() if name not in with_it]
+    for file in (file for file in files if file.suffix.lower() != ".toml" and file.name not in with_it):
         video = _video_of(file, folder / "telemetry")
         if video is not None:
             if video.is_film and (fault := start_fault(file)):
@@ -485,7 +505,7 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
         raise GateError([*faults, *lacking])
     if lacking:
         raise ConfigError(lacking)
-    if not (came.tables or came.videos or came.daveml):
+    if not (came.tables or came.videos or came.daveml or came.vehicles):
         raise GateError(came.skipped, code="nothing-to-import")
     came.tables = [radiosonde_table(table) or table for table in came.tables]
     return came

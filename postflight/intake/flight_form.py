@@ -336,10 +336,20 @@ def _contents(folder: Path, vehicle: str | None) -> tuple[dict[Path, str], dict[
         source = vehicle_path(vehicle)
         named = vehicle
         if source.parent != DATA / "vehicles":
-            read = vehicle_from_toml(source)
+            copies = vehicle_copies(folder, source)
             named = f"vehicle/{source.name}"
-            copies = {folder / "vehicle" / name: source.parent / name for name in (source.name, *read.files)}
     assert _VEHICLE_LINE in flight
-    line = f"vehicle = {quoted(named)}".ljust(_VEHICLE_LINE.index("#", 1)) + "#"
-    texts[folder / "flight.toml"] = flight.replace(_VEHICLE_LINE, line)
+    texts[folder / "flight.toml"] = with_vehicle(flight, named)
     return texts, copies
+
+
+def vehicle_copies(folder: Path, source: Path) -> dict[Path, Path]:
+    """Return where a vehicle file and its tables go in a flight folder, and where each comes from."""
+    names = (source.name, *vehicle_from_toml(source).files)
+    return {folder / "vehicle" / name: source.parent / name for name in names}
+
+
+def with_vehicle(flight: str, named: str) -> str:
+    """Return flight.toml with a vehicle in the line that the form has for it; as it is where that line is gone."""
+    line = f"vehicle = {quoted(named)}".ljust(_VEHICLE_LINE.index("#", 1)) + "#"
+    return flight.replace(_VEHICLE_LINE, line)

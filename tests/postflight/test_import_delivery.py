@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from flightmodel.checks import ConfigError, GateError
 from flightmodel.flightfolder import FlightFile
-from flightmodel.vehicle import vehicle_from_toml, vehicle_path
+from flightmodel.vehicle import DATA, vehicle_from_toml, vehicle_path
 from postflight.cli import cli
 from tests.refusing import numbers_in, printed_codes
 
@@ -255,6 +255,25 @@ def test_coefficients_go_beside_the_vehicle_with_a_form_of_their_sidecar(folder,
     (folder / "vehicle" / "own.toml").write_text(shipped.read_text().replace("irve2_reference.csv", "AERO_1.csv"))
     own = vehicle_from_toml(folder / "vehicle" / "own.toml")
     np.testing.assert_allclose(own.aero.coefficients, vehicle_from_toml(shipped).aero.coefficients, rtol=1e-12)
+
+
+def test_a_vehicle_file_comes_with_its_table_and_is_named(tmp_path):
+    """Delivered side by side, as `*.toml *.csv`: the table is the vehicle's, no other one's."""
+    flight, own = tmp_path / "flight", tmp_path / "ours.toml"
+    text = vehicle_path("irve2_reference").read_text()
+    own.write_text(text.replace('table = "irve2_reference.csv"', 'table = "coefficients.csv"'))
+    delivered = [own, tmp_path / "coefficients.csv", tmp_path / "coefficients.toml"]
+    for path in delivered[1:]:
+        shutil.copyfile(DATA / "aerodynamics" / f"irve2_reference{path.suffix}", path)
+    (tmp_path / "other.toml").write_text("x = 1")
+    run("init", flight)
+    done = run("import", *delivered, tmp_path / "other.toml", "--into", flight)
+    assert done.exit_code == 3
+    assert "left out" in done.output
+    assert printed_codes(done.output) == ["key-missing"]
+    assert read(flight)["vehicle"] == "vehicle/ours.toml"
+    assert all((flight / "vehicle" / path.name).read_bytes() == path.read_bytes() for path in delivered)
+    assert not list((flight / "telemetry").iterdir())
 
 
 def test_two_coefficient_tables_of_one_name_are_refused(folder, tmp_path):
