@@ -82,20 +82,12 @@ COMPONENTS = {
 _STATES = instruments.RADAR.states
 _RANGE_RATE_AT = _STATES.index("range rate bias")  # a reading of its own, with two errors
 _OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-2], _STATES[-2:]
-_RADAR_SLOTS = (*_OWN_RADAR, *(f"sites {name}" for name in instruments.SITES.states), *_LAST)
-# slots of a radar's errors, by their names in the instrument's table; of a survey, north, east and height follow
+# slots of a radar's errors, in the order of the instrument's table; of a survey, north, east and height
 (
     RANGE_BIAS, AZIMUTH_BIAS, ELEVATION_BIAS, TIME_BIAS, TILT_NORTH, TILT_EAST, DROOP, SKEW, NON_ORTHOGONALITY,
-    TRAVERSE_WANDER, ELEVATION_WANDER, REFRACTION, RANGE_SCALE, SURVEY, NORTH, SITES_SURVEY, SITES_NORTH, RANGE_WANDER,
-    SERVO_LAG,
-) = (
-    _RADAR_SLOTS.index(name)
-    for name in (
-        "range bias", "azimuth bias", "elevation bias", "time bias", "tilt north", "tilt east", "droop", "skew",
-        "non-orthogonality", "traverse wander", "elevation wander", "refraction", "range scale", "survey north",
-        "north", "sites survey north", "sites north", "range wander", "servo lag",
-    )
-)  # fmt: skip
+    TRAVERSE_WANDER, ELEVATION_WANDER, REFRACTION, RANGE_SCALE, SURVEY, _, _, NORTH, SITES_SURVEY, _, _, SITES_NORTH,
+    RANGE_WANDER, SERVO_LAG,
+) = range(len(_OWN_RADAR) + len(instruments.SITES.states) + len(_LAST))  # fmt: skip
 # errors that the velocity of a point beside the accelerometer depends on
 _GYROS = (*instruments.RATES.states[:9], "time bias")
 # time biases stand in a radar's slot, and the directions of Sun heads where the compiled kernels look for them

@@ -215,6 +215,7 @@ def test_the_check_of_a_folder_names_its_vehicles_faults_and_strict_counts_them(
 def test_a_strict_run_ends_with_5_after_it_has_written(run, monkeypatch, tmp_path, strict, doubt, code):
     answers = SimpleNamespace(doubt=doubt, refused={}, increments=None, no_increments=None)
     monkeypatch.setattr(commands, "run_flight", lambda *_: (None, answers, tmp_path))
+    monkeypatch.setattr(commands, "read_flight_file", lambda _: SimpleNamespace(loads=None))
     done = run("run", "flight", *["--strict"] * strict)
     assert done.returncode == code
     assert printed_codes(done.stdout) == ["answers-in-doubt"] * (code == 5)
