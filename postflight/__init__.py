@@ -124,7 +124,7 @@ __all__ = [
 
 
 def _require_own_packages() -> None:
-    """Raise `ImportError` where a script or another distribution has a name of ours (docs/decisions/0012)."""
+    """Raise `ImportError` if a script or another distribution shadows one of our packages (docs/decisions/0012)."""
     ours = Path(__file__).parents[1]
     for name in ("flightmodel", "recon", "estimators", "synthetic_flight"):
         found = find_spec(name)

@@ -32,7 +32,7 @@ _KEPT: dict[int, Any] = {}  # results of a worker process by the number of their
 
 @contextlib.contextmanager
 def worker_pool(workers: int, start: str = "spawn") -> Iterator[ProcessPoolExecutor]:
-    """Processes with one thread of linear algebra each; what they still do at the end is stopped."""
+    """Pool of processes with one thread of linear algebra each; unfinished work is stopped at the end."""
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), initializer=_begin)
     pin_threads()
@@ -54,7 +54,7 @@ def worker_pool(workers: int, start: str = "spawn") -> Iterator[ProcessPoolExecu
 
 
 def start_method() -> str:
-    """Return how a process starts: a fork where this thread is the only one, since a fork copies locks of others.
+    """Return the start method of processes: fork only if this is the sole thread, since a fork copies held locks.
 
     A fork has what this process loaded, which takes longer to load than a film to read.
     """
@@ -78,7 +78,7 @@ def _begin() -> None:
 
 
 class Task(Generic[T]):
-    """Work that a `Beside` was given; as an argument of later work it stands for its result, which stays there."""
+    """Task submitted to a `Beside`; as an argument of later tasks it stands for its result, kept in the worker."""
 
     def __init__(self, number: int, work: Callable[..., T] | str, arguments: tuple[Any, ...]) -> None:
         self._number, self._work, self._arguments = number, work, arguments
@@ -88,7 +88,7 @@ class Task(Generic[T]):
         return _kept, (self._number,)
 
     def result(self) -> T:
-        """Return what the work returned, and give its warnings; it is done here where the other process failed."""
+        """Return the result and issue its warnings; the work is repeated here if the worker process failed."""
         return self._result
 
     @cached_property
@@ -113,23 +113,23 @@ class Beside:
         self._numbers = count()
 
     def __enter__(self) -> Beside:
-        """Itself."""
+        """Return itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End it, also in the middle of its work."""
+        """End the process, even in the middle of its work."""
         self.close()
 
     def close(self) -> None:
-        """End it, also in the middle of its work; once it has ended, do nothing."""
+        """End the process, even in the middle of its work; do nothing if it has ended."""
         self._ending.close()
 
     def submit(self, work: Callable[..., T] | str, *arguments: Any) -> Task[T]:
-        """Let it call a function of a module, or the one named ``module:function``, which is not imported here."""
+        """Run a function in the worker, or one named ``module:function``, which is not imported here."""
         return self._begun(Task(next(self._numbers), work, arguments), True)
 
     def keep(self, work: Callable[..., T] | str, *arguments: Any) -> Task[T]:
-        """Let it call a function whose result is an argument of later work and not wanted here."""
+        """Run a function in the worker and keep its result there as an argument of later tasks."""
         return self._begun(Task(next(self._numbers), work, arguments), False)
 
     def _begun(self, task: Task[T], wanted: bool) -> Task[T]:
@@ -141,7 +141,7 @@ class Beside:
 
 
 def same(value: T) -> T:
-    """Return what is given: `Beside.keep` it for several tasks."""
+    """Return the argument unchanged: with `Beside.keep`, several tasks can use it."""
     return value
 
 
@@ -154,7 +154,7 @@ def _call(work: Callable[..., Any] | str, arguments: Any) -> Any:
 
 
 def _answered(number: int, job: bytes, wanted: bool) -> tuple[Any, list[tuple[type[Warning], str]]] | None:
-    """Result and warnings of a job in the worker; None where it raises an error, which the other process then has."""
+    """Result and warnings of a job in the worker; None if it raises, in which case the parent process repeats it."""
     with warnings.catch_warnings(record=True) as given:
         warnings.simplefilter("always")
         try:

@@ -49,7 +49,7 @@ class Commands(click.Group):
 
 
 class NamedChoice(click.Choice[str]):
-    """A choice that names the nearest one to a word that is none."""
+    """Choice that suggests the nearest valid word for an invalid one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         """Value, or a usage error."""
@@ -212,7 +212,7 @@ class FiniteRange(click.FloatRange):
 
 
 class WhatIfs(NamedTuple):
-    """What the options of `what_ifs` say, as `postflight.commands.asked` reads it."""
+    """Options of `what_ifs`, as `postflight.commands.asked` reads them."""
 
     settings: tuple[str, ...]
     without: tuple[str, ...]
@@ -581,7 +581,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _postponed(number: int, frame: FrameType | None) -> bool:
-    """Whether a signal is tried again: amid an import or LLVM's bindings nothing may be raised.
+    """Whether a signal is retried later: no exception may be raised amid an import or LLVM's bindings.
 
     Libraries turn it there into errors of their own; bindings leave objects half made, which fail when they are freed.
     """
@@ -594,7 +594,7 @@ def _postponed(number: int, frame: FrameType | None) -> bool:
 
 
 def unraisable(lost: Any) -> None:
-    """Send a signal again whose exception Python had to drop, as in ``__del__``; show what else it drops."""
+    """Resend a signal whose exception Python had to drop, as in ``__del__``; show any other dropped exception."""
     if issubclass(lost.exc_type, KeyboardInterrupt | SystemExit):
         _try_again(signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM)
     else:
@@ -608,7 +608,7 @@ def _try_again(number: int) -> None:
 
 
 def _send_again(number: int) -> None:
-    """Send a signal to the main thread, so that what it waits for is cut short; Windows lets the wait end first."""
+    """Resend a signal to the main thread to interrupt its wait; on Windows the wait ends first."""
     if sys.platform == "win32":
         _thread.interrupt_main(number)
     else:

@@ -63,7 +63,7 @@ console_err = terminal(stderr=True)
 
 
 def compile_kernels(*groups: str) -> None:
-    """Compile before first use, and say so."""
+    """Compile kernels before first use, and print that."""
     _say_once(warmup.CACHE.remark)
     if not (wanted := warmup.missing(groups)):
         return
@@ -147,10 +147,10 @@ def print_events(flown: list[Event]) -> None:
 
 
 class Stages:
-    """What a command spent its time on: names and seconds, from when it began."""
+    """Names and durations, s, of a command's stages, from its start on."""
 
     def __init__(self, begun: float | None = None) -> None:
-        """Count from a moment of `time.perf_counter`, or from now; what is past is loading the program."""
+        """Count from a moment of `time.perf_counter`, or from now; the time before is loading the program."""
         self._last = time.perf_counter()
         self.seconds = {"loading the program": 0.0 if begun is None else self._last - begun}
 
@@ -174,7 +174,7 @@ def run(
     folder: Path, methods: tuple[str, ...], wanted: Asked, reruns: bool = False, stages: Stages | None = None,
     formats: tuple[str, ...] = (), strict: bool = False,
 ) -> None:  # fmt: skip
-    """Reconstruct, estimate what is asked for, write a run folder, print the story; exit 4 where none answers.
+    """Reconstruct, estimate the deflection, write a run folder and print the results; exit 4 if no method answers.
 
     The answers are printed before tables, figures and report are written. With ``strict`` a failed consistency check
     makes the exit code 5, after everything is written.
@@ -201,7 +201,7 @@ def run(
 
 
 class _Figures:
-    """Figures of a run, drawn beside it; ``bet`` is the task that has its trajectory."""
+    """Figures of a run, drawn in a worker process; ``bet`` is the task that holds its trajectory."""
 
     bet: Task[Reconstruction]
 
@@ -210,7 +210,7 @@ class _Figures:
         self._parts: list[Task[None]] = []
 
     def draw(self, part: str, *arguments: Any) -> None:
-        """Let a function draw_... of `postflight.plots.run_figures` be called."""
+        """Submit a function draw_... of `postflight.plots.run_figures`."""
         self._parts.append(self._beside.submit(f"{FIGURES}:draw_{part}", self.bet, self._folder, *arguments))
 
     def wait(self) -> None:
@@ -295,7 +295,7 @@ def _answered(
     flight: Flight, methods: tuple[str, ...], figures: _Figures, step: Callable[[float, float], Progress],
     stages: Stages, beside: Beside,
 ) -> tuple[Reconstruction, Deflections]:  # fmt: skip
-    """Trajectory, given to be drawn, and deflections; a camera without video is among the methods that were refused."""
+    """Trajectory, handed to the figures, and deflections; a camera without video is among the refused methods."""
     own = warmup.ESTIMATES if "camera" in methods else warmup.ESTIMATES[:1]
     compile_kernels(*warmup.RECONSTRUCTION, "simulator", "ensembles", *own)
     stages.end("compiling")
@@ -323,7 +323,7 @@ def _write_rest(
     out: run_folder.RunFolder, bet: Reconstruction, answers: Deflections, reruns: bool,
     step: Callable[[float, float], Progress],
 ) -> tuple[Bounds | None, pd.DataFrame | None]:  # fmt: skip
-    """Write what comes after the answers; return the rigid vehicle's bounds and the sensitivity, for the figures."""
+    """Write results that follow the answers; return the rigid vehicle's bounds and the sensitivity, for the figures."""
     bounds, table = None, None
     if "camera" in answers.histories:
         with out.part("camera sensitivity"):
@@ -341,7 +341,7 @@ def _write_rest(
 
 @dataclass(frozen=True)
 class Asked:
-    """What a command line asks of a flight: changed assumptions and settings, sources left out, output rate, name."""
+    """Options of a command line: changed assumptions and settings, sources left out, output rate, name."""
 
     changes: dict[str, Any] = field(default_factory=dict)
     without: tuple[str, ...] = ()
@@ -349,7 +349,7 @@ class Asked:
     name: str = ""
 
     def of(self, flight: Flight) -> Flight:
-        """Return the flight as asked for; sources are left out beside those that flight.toml leaves out.
+        """Return the flight with the options applied; sources are left out beside those that flight.toml leaves out.
 
         Raises
         ------
@@ -387,7 +387,7 @@ def asked(
 
 
 def _toml_value(text: str) -> Any:
-    """A value as TOML writes it; ``none`` is None, and what is no TOML is a word."""
+    """Value in TOML's notation; ``none`` is None, and anything that is not TOML is a string."""
     if text.lower() == "none":
         return None
     try:
@@ -424,7 +424,7 @@ def print_flight(flight: Reconstruction, events: pd.DataFrame) -> None:
 
 
 def print_checks(checks: tuple[Check, ...], of: str) -> None:
-    """Print how many checks of something pass, and in red those that fail."""
+    """Print how many checks pass, and in red those that fail."""
     failed = [check for check in checks if not check.passed]
     console.print(f"{len(checks) - len(failed)} of {len(checks)} consistency checks of the {of} pass")
     for check in failed:
@@ -433,7 +433,7 @@ def print_checks(checks: tuple[Check, ...], of: str) -> None:
 
 
 def print_increments(answers: Deflections) -> None:
-    """Aerodynamic increments in one line, and in red those that the preflight table does not allow."""
+    """Print aerodynamic increments in one line, and in red those beyond the vehicle file's uncertainty."""
     if answers.no_increments is not None:
         console.coded("[yellow]left out[/]", str(answers.no_increments), answers.no_increments.code)
     if answers.increments is None:
@@ -512,7 +512,7 @@ def print_answers(answers: Deflections) -> None:
 
 
 def assumed(plane_deg: float | None, joint_m: float | None) -> dict[str, Any]:
-    """Assumptions of the camera, as `Flight.with_` takes them, that are stated."""
+    """Stated camera assumptions, in the form of `Flight.with_`."""
     given = {"camera_plane_lv_deg": plane_deg, "joint_station_m": joint_m}
     return {name: value for name, value in given.items() if value is not None}
 
@@ -594,7 +594,7 @@ def deflection_of_film(
 
 
 def _finish_alone(given: Path, answers: Deflections, flight: Flight) -> None:
-    """Write answers that no run holds into ``<stem>-deflection`` beside what they were made from, and print them."""
+    """Write answers without a run into ``<stem>-deflection`` beside their input, and print them."""
     out = run_folder.Results(given.with_name(f"{given.stem}-deflection"))
     (out.path / "figures").mkdir(parents=True, exist_ok=True)
     _write_alone(out, answers, flight, {"methods": list(answers.histories), "changes": list(flight.changes)})
@@ -616,7 +616,7 @@ def _write_alone(
 
 
 def _print_alone(answers: Deflections, flight: Flight, path: Path, strict: bool = False) -> None:
-    """Print findings, answers and what they rest on; exit 4 where a method has none, 5 in doubt with ``strict``."""
+    """Print findings, answers and their assumptions; exit 4 if a method has none, 5 if doubtful with ``strict``."""
     telemetry = flight.telemetry
     for words, code in few_of_each(telemetry.findings):
         console.coded("[yellow]found[/]", words, code)

@@ -1,4 +1,4 @@
-"""How do runs differ? Values of complete runs side by side, and differences with what is known of their sd.
+"""How do runs differ? Values of complete runs side by side, and their differences with bounds of the sd.
 
 Values are those at the first run's peak dynamic pressure where all runs count time from the same moment, else each at
 its own. The variance of a difference is ``s1^2 + s2^2 - 2 r s1 s2`` with a correlation ``r`` that depends on what the
@@ -36,7 +36,7 @@ APART = (("position_m", "m", 1.0), ("velocity_mps", "m/s", 1.0), ("attitude_deg"
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is compared: words, unit, and its column's name, which ends in the unit."""
+    """Compared quantity: words, unit, and its column's name, which ends in the unit."""
 
     words: str
     unit: str
@@ -88,7 +88,7 @@ class RunComparison(Tabular):
 
     @cached_property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What at least one run has."""
+        """Quantities that at least one run has."""
         methods = [m for m in METHODS if any(run.history(m) is not None for run in self.runs)]
         found = [Quantity(f"deflection: {m}", "deg", f"deflection_{m}_deg") for m in methods]
         found += [Quantity(f"largest: {m}", "deg", f"largest_{m}_deg") for m in methods]
@@ -102,7 +102,7 @@ class RunComparison(Tabular):
 
     @cached_property
     def relations(self) -> tuple[Relation, ...]:
-        """How each run but the first is related to it."""
+        """Relation of each run's errors, but the first's, to those of the first."""
         return tuple(_relation(self.runs[0], run) for run in self.runs[1:])
 
     def value(self, number: int, quantity: Quantity) -> tuple[float, float]:
@@ -110,7 +110,7 @@ class RunComparison(Tabular):
         return self.values[number].get(quantity.column, (np.nan, np.nan))
 
     def apart(self, number: int, quantity: Quantity) -> tuple[float, float, float, float]:
-        """Difference of a run to the first one, its sd (NaN where not known), and the bounds of that."""
+        """Difference of a run from the first one, its sd (NaN if unknown), and the bounds of the sd."""
         (first, first_sd), (other, other_sd) = self.value(0, quantity), self.value(number, quantity)
         low, high = sd_bounds(first_sd, other_sd)
         independent = self.relations[number - 1].kind == INDEPENDENT
@@ -126,7 +126,7 @@ class RunComparison(Tabular):
         return max(sizes)
 
     def to_frame(self) -> pd.DataFrame:
-        """One row a run: what it is, then each quantity with its sd, units in the columns' names."""
+        """One row per run: its identification, then each quantity with its sd, units in the columns' names."""
         rows = []
         for k, run in enumerate(self.runs):
             row: dict[str, Any] = {
@@ -161,7 +161,7 @@ class RunComparison(Tabular):
         return pd.concat([_over_time(self.runs[0], run).assign(run=run.path.name) for run in self.runs[1:]])
 
     def checks(self) -> pd.DataFrame:
-        """One row a check: of each run, by its number, value, limits and whether it passed."""
+        """One row per check: value, limits and whether it passed, for each run by its number."""
         tables = []
         for k, run in enumerate(self.runs, 1):
             table = run.checks[["name", "value", "low", "high", "passed"]]
@@ -198,7 +198,7 @@ def sd_bounds(first_sd: Sd, other_sd: Sd) -> tuple[Sd, Sd]:
 
 
 def _labels(runs: tuple[Run, ...]) -> tuple[str, ...]:
-    """Names; else changes, else that there are none; with the flight's where there are several."""
+    """Label of each run: its name, or its changes, or "as stated"; with the flight's name if there are several."""
     several = len({run.header["flight"] for run in runs}) > 1
     out = []
     for run in runs:
@@ -229,7 +229,7 @@ def _values(run: Run, at_s: float) -> dict[str, tuple[float, float]]:
 
 
 def _near(bet: pd.DataFrame, column: str, at_s: float) -> tuple[float, float]:
-    """Value and sd from the rows that hold one; NaN where none is near."""
+    """Value and sd from the nearest rows that have one; NaN if none is near."""
     known = bet[bet[column].notna()]
     step = float(np.median(np.diff(bet["t_s"])))
     if np.abs(known["t_s"] - at_s).min() > step or len(known) < 4:
@@ -248,7 +248,7 @@ def _relation(first: Run, other: Run) -> Relation:
 
 
 def _over_time(first: Run, other: Run) -> pd.DataFrame:
-    """Differences of a run to the first one at the first one's times that both cover, over the pulse and about it."""
+    """Differences of a run from the first one, at the first one's times that both cover, in and around the pulse."""
     a, b = first.tables["bet"], other.tables["bet"]
     rows = a["t_s"].between(b["t_s"].iloc[0], b["t_s"].iloc[-1])
     if rows.sum() < 2:

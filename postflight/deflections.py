@@ -40,7 +40,7 @@ PAPER_TABLE_2_1_DEG = {153.0: 4.2, 183.0: 5.8, 200.0: 6.2}
 
 @dataclass(frozen=True, repr=False)
 class Deflections(Tabular):
-    """Deflection histories by method, why a method gave none, and what stands behind the fused one.
+    """Deflection histories by method, reasons of methods without one, and the posterior behind the fused one.
 
     ``answer["camera"]`` is the history of a method, and ``for method in answer`` goes through those that answered.
 
@@ -98,7 +98,7 @@ class Deflections(Tabular):
 
     @property
     def continuous(self) -> dict[str, DeflectionHistory]:
-        """Each method's answer at any time: of the camera, between whose frames the shell swings, the smooth one."""
+        """Each method's answer at any time; for the camera, the smoothed history between its frames."""
         return self.histories | ({} if self.smooth_camera is None else {"camera": self.smooth_camera})
 
     @property
@@ -117,7 +117,7 @@ class Deflections(Tabular):
 
     @property
     def pulse_s(self) -> tuple[float, float]:
-        """Begin and end of the pressure pulse, in which the largest deflection is looked for; all without a trajectory.
+        """Begin and end of the pressure pulse, searched for the largest deflection; all times without a trajectory.
 
         Where there is hardly a load the largest answer is that of the largest noise.
         """
@@ -155,7 +155,7 @@ class Deflections(Tabular):
 
     @property
     def doubt(self) -> str:
-        """What the failed checks of trajectory, air and deflection mean for the answers; empty where all pass."""
+        """Consequences of failed checks of trajectory, air and deflection for the answers; empty if all pass."""
         of_bet = () if self.bet is None else self.bet.consistency_checks
         checks = (*of_bet, *self.consistency_checks)
         return doubt([check.name for check in checks if not check.passed], len(checks))
@@ -214,12 +214,12 @@ def said(row: Mapping[str, Any], at: str = "at peak q") -> dict[str, str]:
 
 
 def headline(row: Mapping[str, Any], unit: str = "°", at: str = "at peak q") -> str:
-    """Say a method's answer in one line."""
+    """Deflection by one method in one line."""
     return f"Deflection {', '.join(f'{name} {value}{unit}' for name, value in said(row, at).items())}"
 
 
 def borne_out(check: Check, agreement: Agreement) -> Check:
-    """Check of a camera: features that its film lacks are no fault where the inertial methods agree with its answer."""
+    """Check of a camera; missing features are not flagged if the inertial methods agree with the camera."""
     compared = [pair for pair in agreement.pairs if "camera" in pair.methods]
     if check.passed or check.code != "camera-features" or not compared or agreement.hypotheses:
         return check
@@ -228,7 +228,7 @@ def borne_out(check: Check, agreement: Agreement) -> Check:
 
 
 def no_answer_at(history: DeflectionHistory, at_s: float) -> Issue:
-    """Why a history with answers has none at a time, which lies outside them or in a gap."""
+    """Reason why a history has no answer at a time: outside its span, or in a gap."""
     known = history.time_s[np.isfinite(history.theta_rad)]
     first, last = float(known[0]), float(known[-1])
     where = "a gap" if first < at_s < last else "the data begin" if at_s <= first else "the data end"
@@ -237,7 +237,7 @@ def no_answer_at(history: DeflectionHistory, at_s: float) -> Issue:
 
 
 def quantiles_at(history: DeflectionHistory, at_s: float) -> FloatArray:
-    """Quantiles (5,) of the angle at a time, rad, between answers as wide as the sd of `angle_at`; NaN without one."""
+    """Quantiles (5,) of the angle at a time, rad, scaled between answers to the sd of `angle_at`; NaN without one."""
     quantiles, (theta, sd) = history.theta_quantiles_rad, history.angle_at(at_s)
     known = np.isfinite(quantiles).all(axis=1)
     if not np.isfinite(theta) or not known.any():
@@ -298,7 +298,7 @@ def estimate_misalignment(flown: Reconstruction | FlightLoads | Flight) -> Defle
 
 @on_one_thread
 def estimate_trim(flown: Reconstruction | FlightLoads | Flight) -> DeflectionHistory:
-    """Deflection whose c.g. offset trims the vehicle at the angle it flew, seed paper eqs. [5] and [6].
+    """Deflection whose c.g. offset trims the vehicle at the measured angle of attack, seed paper eqs. [5] and [6].
 
     Parameters
     ----------
@@ -317,7 +317,7 @@ def estimate_trim(flown: Reconstruction | FlightLoads | Flight) -> DeflectionHis
 
 @on_one_thread
 def fuse(flown: Reconstruction | FlightLoads | Flight, progress: Progress | None = None) -> Deflections:
-    """Deflection by every method that the flight has data for, and one posterior of them all.
+    """Deflection by every method that the flight has data for, and their common posterior.
 
     Parameters
     ----------
@@ -342,7 +342,7 @@ def _has_loads(flown: object) -> bool:
 
 
 def _loads_of(name: str, flown: Reconstruction | FlightLoads | Flight | None) -> FlightLoads:
-    """Loads that a public function was given, or those of its reconstruction or flight."""
+    """Loads from the argument of a public function: given directly, or those of its reconstruction or flight."""
     if isinstance(flown, FlightLoads):
         return flown
     if isinstance(flown, Flight) and flown.loads is not None:
@@ -421,7 +421,7 @@ def estimate(
 
 
 def _inputs(flight: Flight | None, loads: FlightLoads | None) -> Inputs:
-    """What there is of a flight, or of loads."""
+    """Available inputs of a flight, or of a table of loads."""
     given = loads if flight is None else flight.telemetry
     return Inputs() if given is None else Inputs.of(given)
 
@@ -465,7 +465,7 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
 
 
 def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
-    """Increments; where there are none because of a late film, that is said first."""
+    """Increments; if there are none and the film's clock is off, the error names the clock first."""
     from postflight.flown_coefficients import increments_of
 
     try:
@@ -496,7 +496,7 @@ def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> Defl
 
 
 def camera_for_fusion(flight: Flight) -> DeflectionHistory | None:
-    """Camera's history where the camera itself was not asked for; None without usable video."""
+    """Camera's history for the fusion if the camera itself was not requested; None without usable video."""
     if not flight.telemetry.films:
         return None
     try:

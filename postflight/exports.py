@@ -1,4 +1,4 @@
-"""How does a run leave for another program? `postflight export`: a run as one file in the program's format.
+"""How is a run handed to another program? `postflight export`: a run as one file in the program's format.
 
 =========  ==========================================================================================================
 csv        trajectory with UTC, deflections interpolated to its times
@@ -62,7 +62,7 @@ _OEM_STATE = ["rx_ecef_m", "ry_ecef_m", "rz_ecef_m", "vx_ecef_mps", "vy_ecef_mps
 
 @dataclass(frozen=True)
 class Source:
-    """One run, read.
+    """A run as read for export.
 
     Parameters
     ----------
@@ -104,13 +104,13 @@ class Source:
 
     @property
     def title(self) -> str:
-        """What the file is, in a line."""
+        """Title of the file, in one line."""
         kind = "SYNTHETIC flight" if self.synthetic else "flight"
         return f"Best-estimated trajectory and deflections of the {kind} {self.name}{self.what_if}"
 
     @property
     def what_if(self) -> str:
-        """Assumptions in which the run differs from its flight folder, to stand behind a title; empty for none."""
+        """Assumptions that differ from the run's flight folder, to follow a title; empty if there are none."""
         changes = self.header.get("changes")  # runs of before have none there
         return f"; what-if: {'; '.join(changes)}" if changes else ""
 
@@ -299,7 +299,7 @@ def _oem(source: Source) -> bytes:
 
 
 def _message(template: str, source: Source, **values: Any) -> bytes:
-    """CCSDS message of a template."""
+    """CCSDS message from a template."""
     name = "".join(c if c.isalnum() and c.isascii() else "_" for c in source.name) or "flight"
     return _filled(template, source=source, name=name, **values)
 
@@ -362,7 +362,7 @@ def _msopck_setup(source: Source, data: Path) -> bytes:
 
 
 def _printable(text: str, instead: str = " ", *, ascii_only: bool = False) -> str:
-    """Text with ``instead`` for every character that a format has no place for."""
+    """Text with ``instead`` in place of every character that a format does not allow."""
     return "".join(c if c.isprintable() and (c.isascii() or not ascii_only) else instead for c in text)
 
 

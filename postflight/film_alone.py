@@ -112,7 +112,7 @@ def read_film(
 
 
 def _camera_name(vehicle: Vehicle, camera: str | None) -> str:
-    """The camera that is meant, or the only one."""
+    """Name of the requested camera, or of the only one."""
     names = list(vehicle.cameras)
     if camera in names or (camera is None and len(names) == 1):
         return camera or names[0]
@@ -147,7 +147,7 @@ def _times(times: float | Sequence[float] | FloatArray, start_s: float, found: _
 
 
 def _pictures(given: str | Path | Sequence[Image], frames: list[str] | None, mount: CameraMount) -> _Pictures:
-    """Pictures by their names or numbers in a list, or all; `GateError` with those that cannot be used."""
+    """Pictures by their names or numbers in a list, or all; `GateError` naming those that cannot be used."""
     if not isinstance(given, str | Path):
         return _in_memory(given, mount)
     path = Path(given)

@@ -41,7 +41,7 @@ _MOST_ORIENTED = 4
 
 @dataclass(frozen=True)
 class CameraAnswer:
-    """What the cameras answer.
+    """Deflection by all cameras, and the data behind it.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class CameraAnswer:
 
 
 def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress | None = None) -> FilmFit:
-    """What a film shows, frame by frame, the first camera's without ``frames``; `GateError` where it cannot be used."""
+    """Frame-by-frame fit of a film, the first camera's without ``frames``; `GateError` if it is not usable."""
     frames = flight.telemetry.frames if frames is None else frames
     Inputs.of(flight.telemetry).require("camera")
     assert frames is not None
@@ -109,7 +109,7 @@ def camera_film(flight: Flight, frames: Frames | None = None, progress: Progress
 
 
 def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
-    """Camera oriented on the benchmark frame of a film, with what an analyst decided about it.
+    """Camera oriented on the benchmark frame of a film, with the analyst's decisions applied.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def orient_on_film(frames: Frames, vehicle: Vehicle) -> OrientedCamera:
 
 
 def keep_oriented(telemetry: Telemetry, oriented: dict[str, OrientedCamera]) -> None:
-    """Let `orient_on_film` have cameras that an answer, perhaps of another process, was made with."""
+    """Give `orient_on_film` the oriented cameras of an answer, which may come from another process."""
     for name, one in oriented.items():
         _keep(telemetry.films[name], telemetry.required_vehicle(), one)
 
@@ -139,7 +139,7 @@ def _keep(frames: Frames, vehicle: Vehicle, oriented: OrientedCamera) -> None:
 
 
 def joint_swing(vehicle: Vehicle) -> JointSwing | None:
-    """How fast the vehicle's joint swings; None without a spring that bends."""
+    """Natural frequency of the vehicle's joint and its damping; None without a spring that bends."""
     critical = vehicle.critical_damping_nmsprad()
     if not critical > 0.0:
         return None
@@ -251,7 +251,7 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
 
 
 def _of_all(joined: JoinedCameras, refused: dict[str, Issue]) -> list[Check]:
-    """Whether the cameras agree, and each has an answer."""
+    """Checks that the cameras agree, and that each has an answer."""
     checks = []
     if joined.tests:
         least, name = min(test.p_value for test in joined.tests), "cameras agree: least chance of a test"
@@ -265,7 +265,7 @@ def _of_all(joined: JoinedCameras, refused: dict[str, Issue]) -> list[Check]:
 def _with_shell_shape(
     films: dict[str, FilmFit], flight: Flight, bet: Reconstruction | None
 ) -> tuple[dict[str, FilmFit], ShellShape | None, str]:
-    """Films with the shell's shape under load in their answers, that shape, and a remark on it or why there is none."""
+    """Films corrected for the shell's shape under load, that shape, and a remark on it or why there is none."""
     try:
         if bet is None:
             raise GateError("no trajectory was made", "input-missing")
@@ -301,7 +301,7 @@ def _benchmark(
 
 
 def _features(source: str, name: str, film: FilmFit, flight: Flight) -> list[Check]:
-    """Whether a film's benchmark frame shows the features that the vehicle file states, if any."""
+    """Check that a film's benchmark frame shows the features of the vehicle file; none if it states none."""
     if flight.telemetry.required_vehicle().geometry.features in ("none", "texture"):
         return []
     why, words = (
@@ -323,7 +323,7 @@ def _features(source: str, name: str, film: FilmFit, flight: Flight) -> list[Che
 def _rests(
     source: str, name: str, film: FilmFit, history: DeflectionHistory, bet: Reconstruction | None, corrected: bool
 ) -> list[Check]:
-    """Whether a camera's shell rests in frames without load; nothing where no frame can say.
+    """Check that a camera's shell is at rest in frames without load; none if no frame can show it.
 
     The load is the moment in the joint, or without inertial sensors the dynamic pressure; unknown without a trajectory.
     """

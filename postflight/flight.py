@@ -41,7 +41,7 @@ SETTINGS = {f.name for f in fields(Settings)}
 
 @dataclass(frozen=True, repr=False)
 class Flight(Tabular):
-    """A flight as measured, with the assumptions under which it is looked at.
+    """A measured flight with the assumptions of one analysis.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class Flight(Tabular):
 
     @property
     def findings(self) -> tuple[Issue, ...]:
-        """What the gate found in the data: gaps, frozen and missing samples, repairs of row order."""
+        """Findings of the gate in the data: gaps, frozen and missing samples, repairs of row order."""
         return self.telemetry.findings
 
     @property
@@ -226,7 +226,7 @@ def flight_of_table(table: Path, vehicle: Vehicle, columns: Mapping[str, str], e
 
 
 def _as_read(folder: Path, telemetry: Telemetry) -> dict[str, bytes]:
-    """Content of flight.toml and the vehicle's files; `GateError` where it is no longer what was read."""
+    """Content of flight.toml and the vehicle's files; `GateError` if they have changed since they were read."""
     places = {"flight.toml": (folder / "flight.toml", "flight.toml")}
     vehicle = telemetry.vehicle
     if vehicle is not None:
@@ -253,12 +253,12 @@ def with_wind(sounding: Sounding, factor: float) -> Sounding:
 
 
 def with_density(sounding: Sounding, factor: Any) -> Sounding:
-    """Sounding with density and pressure multiplied by a number or one a level ``(n,)``, temperature kept."""
+    """Sounding with density and pressure multiplied by one factor or one per level ``(n,)``, temperature unchanged."""
     return replace(sounding, density_kgpm3=factor * sounding.density_kgpm3, pressure_pa=factor * sounding.pressure_pa)
 
 
 def with_mass(telemetry: Telemetry, factor: float) -> Telemetry:
-    """Telemetry of a vehicle whose parts are all heavier by a factor, and which drag slows less."""
+    """Telemetry with all of the vehicle's masses scaled by a factor, and its drag deceleration reduced accordingly."""
     motion = replace(telemetry.motion, drag_area_per_mass_m2pkg=telemetry.motion.drag_area_per_mass_m2pkg / factor)
     vehicle = telemetry.vehicle
     if vehicle is not None:
@@ -267,7 +267,7 @@ def with_mass(telemetry: Telemetry, factor: float) -> Telemetry:
 
 
 def _changed(flight: Flight, name: str, value: Any) -> Flight:
-    """One assumption changed; `GateError` where it cannot be."""
+    """Telemetry with one assumption changed; `GateError` if it cannot be."""
     if flight.telemetry.loads is not None and name not in _OF_VEHICLE:
         return replace(flight, telemetry=_loads_error(flight.telemetry, name, value))
     if name in SETTINGS:
@@ -305,7 +305,7 @@ def _vehicle_of(telemetry: Telemetry, name: str) -> Vehicle:
 
 
 def _reach_m(vehicle: Vehicle) -> float:
-    """How far the vehicle reaches aft of its nose, m: the centerbody, or a shell drawn as a sharp cone."""
+    """Largest distance of the vehicle aft of its nose, m: of the centerbody, or of a shell drawn as a sharp cone."""
     shell = vehicle.geometry
     return max(shell.centerbody_length_m, float(shell.base_radius_m / np.tan(np.deg2rad(shell.half_angle_deg))))
 
@@ -368,7 +368,7 @@ def _attitude_prior(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
 
 
 def _loads_error(telemetry: Telemetry, name: str, value: Any) -> Telemetry:
-    """Telemetry in which the table of loads has another standard deviation."""
+    """Telemetry with another standard deviation in the table of loads."""
     table = telemetry.loads
     assert table is not None
     if name not in LoadsErrors.model_fields:

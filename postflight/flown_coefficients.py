@@ -1,4 +1,4 @@
-"""What did the air do to the shell in flight, against the preflight table? Increments, and the table as flown.
+"""How do the in-flight coefficients differ from the preflight table? Increments, and the table as flown.
 
 The increments are those of `estimators.increments`: of forces, moments and rates through the pressure pulse, given the
 flow, its air, the mass properties and every reading of the deflection. A run leaves them as ``aero_increments.csv``
@@ -64,7 +64,7 @@ class AeroIncrements(Tabular):
 
     @property
     def determined(self) -> FloatArray:
-        """Mask (4, k) of the increments that the flight determines: less than `MOST_KEPT_SD` of the sd is left."""
+        """Mask (4, k) of the increments that the flight determines: sd below `MOST_KEPT_SD` of the stated one."""
         return np.asarray(self.sd < MOST_KEPT_SD * self.found.processes.stated_sd[:, None])
 
     @cached_property
@@ -112,7 +112,7 @@ class AeroIncrements(Tabular):
 
     @property
     def _scale(self) -> FloatArray:
-        """What an increment of the posterior is multiplied by (4, k): the preflight value of all but C_mq."""
+        """Scale (4, k) of the posterior's increments: the preflight value of all but C_mq."""
         return np.concatenate([self.preflight[:3], np.ones_like(self.preflight[3:])])
 
     @cached_property
@@ -133,7 +133,7 @@ class AeroIncrements(Tabular):
 
     @property
     def consistency_checks(self) -> tuple[Check, ...]:
-        """Whether each coefficient's increments are within what the vehicle file states; none where not observable."""
+        """Whether each coefficient's increments agree with the vehicle file's uncertainty; none if not observable."""
         found = []
         for k, name in enumerate(COEFFICIENTS):
             prior_sd = np.full(len(self.found.mach), self.found.processes.stated_sd[k])
@@ -148,7 +148,7 @@ class AeroIncrements(Tabular):
         return tuple(check for check in found if check is not None)
 
     def summary(self) -> dict[str, Any]:
-        """Increments at the largest dynamic pressure, for ``summary.json``: fractions, and C_mq's as it is."""
+        """Increments at the largest dynamic pressure, for ``summary.json``: as fractions, but C_mq's absolute."""
         peak = int(np.argmax(self.pulse.dynamic_pressure_pa))
         at = int(np.argmax(self.found.processes.weights(self.pulse.mach[[peak]])[0]))
         out: dict[str, Any] = {"mach": float(self.found.mach[at])}
@@ -185,7 +185,7 @@ class AeroIncrements(Tabular):
 
     @property
     def about(self) -> str:
-        """One line: the increments at the largest dynamic pressure."""
+        """Increments at the largest dynamic pressure, in one line."""
         return self._about()
 
     def _about(self) -> str:

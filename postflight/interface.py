@@ -169,7 +169,7 @@ def write_report(folder: str | Path, run: str | Path | None = None) -> Path:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Tabular):
-    """Two looks at one flight, side by side; see `compare`."""
+    """Comparison of two analyses of one flight; see `compare`."""
 
     table: pd.DataFrame
     names: tuple[str, str]
@@ -183,7 +183,7 @@ class Comparison(Tabular):
 
 
 def compare(first: Reconstruction | Deflections, second: Reconstruction | Deflections) -> Comparison:
-    """Set two looks at one flight side by side, e.g. the flight and a what-if.
+    """Compare two analyses of one flight, e.g. the flight and a what-if.
 
     Parameters
     ----------

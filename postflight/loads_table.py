@@ -96,7 +96,7 @@ def read_loads(
 
 
 class ReadLoads(NamedTuple):
-    """Loads, the table's columns that are not used, and keys of `LoadsErrors` whose errors columns of it state."""
+    """Loads, unused columns of the table, and keys of `LoadsErrors` whose values the table's columns state."""
 
     loads: FlightLoads
     unused: list[str]
@@ -107,7 +107,7 @@ def read_table_of_loads(
     table: str | Path | pd.DataFrame, vehicle: Vehicle, columns: Mapping[str, str], entry: LoadsEntry,
     time_s: FloatArray | None = None,
 ) -> ReadLoads:  # fmt: skip
-    """Loads by what flight.toml or a command states of a table; ``time_s`` (n,) are clock times that it has."""
+    """Loads from a table as flight.toml or a command describes it; ``time_s`` (n,) are its clock times, if any."""
     arm_m = _cg_from_sensor(vehicle, entry.acceleration_at)
     found = find_columns(_as_table(table), dict(columns), time_s)
     made = _columns(found, entry)
@@ -145,7 +145,7 @@ def _cg_from_sensor(vehicle: Vehicle, at: str | tuple[float, float, float]) -> F
 
 
 def _columns(found: FoundColumns, entry: LoadsEntry) -> LoadsColumns:
-    """Columns as the loads need them; `GateError` with everything that is missing."""
+    """Columns in the units and axes of the loads; `GateError` with everything that is missing."""
     faults = found.faults
     if missing := found.missing:
         found.leave_open(missing[0], f"no column of {', '.join(missing)}", "column-missing")
@@ -189,7 +189,7 @@ def _velocity_air_body(values: dict[str, FloatArray]) -> FloatArray | None:
 
 
 def _complete(values: dict[str, FloatArray], velocity: FloatArray | None) -> None:
-    """Add the third of Mach number, dynamic pressure and airspeed by the standard atmosphere."""
+    """Compute the missing one of Mach number, dynamic pressure and airspeed from the standard atmosphere."""
     if velocity is not None:
         values.setdefault("airspeed", np.linalg.norm(velocity, axis=1))
     density, temperature, _ = us76(np.clip(values["altitude"], 0.0, 150e3))
@@ -213,7 +213,7 @@ def _flow(at: dict[str, FloatArray], velocity: FloatArray | None) -> FloatArray:
 
 
 def _flow_sd(at: dict[str, FloatArray]) -> FloatArray | None:
-    """Standard deviation (n,) of each component of the flow, of the columns that state one."""
+    """Standard deviation (n,) of each flow component, from the columns that state one."""
     stated = [at[name] for name in ("alpha_sd", "beta_sd", "alpha_total_sd") if name in at]
     return _whole(np.sqrt(np.mean(np.square(stated[:2]), axis=0))) if stated else None
 
@@ -224,7 +224,7 @@ def _whole(values: FloatArray | None) -> FloatArray | None:
 
 
 def _check(label: str, loads: FlightLoads) -> None:
-    """Refuse columns that contradict each other: units, signs, or another vehicle."""
+    """Refuse columns that contradict each other or the vehicle, in units or signs."""
     rows = loads.informative & (loads.altitude_m < _STANDARD_HOLDS_M)
     if not rows.any():
         words = f"nowhere below {_STANDARD_HOLDS_M / 1e3:.0f} km is there {MIN_AXIAL_MPS2:.1f} m/s2 of drag along -x"
@@ -251,7 +251,7 @@ def _check(label: str, loads: FlightLoads) -> None:
 
 
 def _axial_ratio(loads: FlightLoads) -> FloatArray:
-    """Axial force over that of the vehicle file's axial coefficient (n,)."""
+    """Axial force over the one predicted with the vehicle file's axial coefficient (n,)."""
     vehicle = loads.vehicle
     angle = np.minimum(np.linalg.norm(loads.flow_yz_rad, axis=1), 0.5)
     axial = np.array([vehicle.aero.at(m, a)[0] for m, a in zip(loads.mach, angle, strict=True)])

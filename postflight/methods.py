@@ -49,7 +49,7 @@ _NO_TRIADS = Issue(
 
 @dataclass(frozen=True)
 class Inputs:
-    """What data there are: vehicle file, film, accelerometer with gyros, tracker (or entry state), table of loads."""
+    """Available data: vehicle file, film, accelerometer with gyros, tracker (or entry state), table of loads."""
 
     vehicle: bool = False
     film: bool = False
@@ -71,7 +71,7 @@ class Inputs:
         return cls(given.vehicle is not None, bool(given.films), inertial, tracker, loads is not None)
 
     def missing(self) -> dict[str, Issue]:
-        """Why a method cannot run, by method; those that can are not among them."""
+        """Reason why a method cannot run, by method; methods that can run are left out."""
         out = {}
         if not self.tracker:
             out["trajectory"] = _OTHER_TEAMS if self.loads else _NO_TRACKER

@@ -26,7 +26,7 @@ _VALUE = re.compile(r"(?P<before>\s*(?P<key>[\w-]+)\s*=\s*)(?P<value>[^#\s]+)(?P
 
 
 def run(folder: Path, accept: bool) -> None:
-    """Print what the flight says of the noise levels in its flight.toml, and write them there where asked."""
+    """Print the noise levels that the flight implies for its flight.toml, and write them there if asked."""
     compile_kernels(*RECONSTRUCTION)
     with progress_bar() as report:
         flight = read_flight(folder)
@@ -51,7 +51,7 @@ def run(folder: Path, accept: bool) -> None:
 
 
 def accepted_values(found: NoiseLevels) -> dict[tuple[str, str], float]:
-    """Levels that differ from what is stated, by table and key, to three digits."""
+    """Levels that differ from the stated ones, by table and key, to three digits."""
     return {(level.table, level.key): float(f"{level.proposed:.{DIGITS}g}") for level in found.levels if level.changed}
 
 

@@ -133,7 +133,7 @@ DEPENDENCE = {
 
 @dataclass(frozen=True, repr=False)
 class Reconstruction(Tabular):
-    """A flight with its best-estimated trajectory and the air it met.
+    """A flight's best-estimated trajectory and the atmosphere along it.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class Reconstruction(Tabular):
 
     @property
     def rests_on(self) -> tuple[str, ...]:
-        """On what position, height, azimuth and the level of as-flown density rest, which no residual shows."""
+        """Assumptions behind position, height, azimuth and the density level that residuals cannot test."""
         lines, vehicle = rests_on(self.telemetry, self.solution.settings), self.telemetry.vehicle
         if self.density is not None and self.telemetry.drag is not None:
             drag_percent = 100.0 * self.telemetry.drag.sd
@@ -248,13 +248,13 @@ class Reconstruction(Tabular):
 
     @property
     def peak_lies(self) -> str:
-        """Where the largest dynamic pressure lies that is no peak, in words; empty of a peak."""
+        """Why the largest dynamic pressure is not a peak: gap or edge of the data; empty if it is a peak."""
         if self._unread(np.array([self.peak_s]), _EDGE_S)[0]:
             return "gap in the data"
         return "" if self.air.time_s[0] + _EDGE_S < self.peak_s < self.air.time_s[-1] - _EDGE_S else "edge of data"
 
     def _unread(self, time_s: FloatArray, about_s: float = 0.0) -> BoolArray:
-        """Whether an accelerometer that the drag follows has no readings for long at, or about, times (n,)."""
+        """Whether the accelerometer of the drag has a long gap at, or about, times (n,)."""
         record, out = self.telemetry.drag_accelerometer, np.zeros(len(time_s), dtype=bool)
         for gap in self.findings:
             long = gap.end_s - gap.start_s > _EDGE_S
@@ -326,7 +326,7 @@ def reconstruct(flight: Flight, settings: Settings | None = None, progress: Prog
 
 
 def _with_clocks(flight: Flight, fault: GateError) -> GateError:
-    """Return a fault; of a trajectory that diverges with the time tags that are off."""
+    """Return the error; for a diverging trajectory, extended by the time tags that are off."""
     found = clock_faults(flight.telemetry, flight.settings.without) if isinstance(fault, DivergenceError) else ()
     return DivergenceError("; ".join((str(fault), *found)), fault.codes[0]) if found else fault
 
@@ -360,7 +360,7 @@ def reconstruction_from(flight: Flight, solution: TrajectorySolution) -> Reconst
 
 
 def _check_axes(solution: TrajectorySolution) -> None:
-    """Raise `GateError` where accelerometer and gyros do not have one set of axes: no loads follow from them."""
+    """Raise `GateError` if accelerometer and gyros do not share one set of axes, since loads need both."""
     swings = solution.adaptation.oscillation
     if swings is not None and not swings.one_set_of_axes:
         (check,) = (v for v in solution.consistency_checks if v.code == "triads-axes")
@@ -388,12 +388,12 @@ def air_data(trajectory: Trajectory, flight: Flight) -> AirData:
 
 
 def _arm(vehicle: Vehicle | None) -> FloatArray:
-    """Point that meets the air, from the datum, body axes (3,), m: the c.g., or the datum of no vehicle."""
+    """Reference point of the flow, from the datum, body axes (3,), m: the c.g., or without a vehicle the datum."""
     return np.zeros(3) if vehicle is None else vehicle.cg_m
 
 
 def _check_inside_tables(trajectory: Trajectory) -> None:
-    """Raise `DivergenceError` where the reconstruction left the ground or the atmosphere's tables."""
+    """Raise `DivergenceError` if the reconstruction leaves the altitudes between ground and top of the air tables."""
     _, _, altitude_m = earth.geodetic_from_ecef(trajectory.position_ecef_m, trajectory.planet)
     wrong = (altitude_m < bottom_m(trajectory.planet)) | (altitude_m > TOP_M)
     if wrong.any():
@@ -605,7 +605,7 @@ def loads_from_solution(telemetry: Telemetry, bet: TrajectorySolution, air: AirD
 
 
 def fastest_radps(vehicle: Vehicle, bet: TrajectorySolution, air: AirData) -> float:
-    """Rate, rad/s, at which the transverse rates turn in body axes: rigid pitching at peak pressure, and spin there."""
+    """Angular frequency, rad/s, of the transverse rates in body axes: rigid pitching with spin, at peak pressure."""
     peak = int(np.nanargmax(air.dynamic_pressure_pa))
     spin = float(np.interp(bet.smoothed.time_s[peak], bet.imu_time_s, bet.rate_body_radps[:, 0]))
     return pitching_radps(vehicle, float(air.mach[peak]), float(air.dynamic_pressure_pa[peak]), spin)
@@ -653,7 +653,7 @@ class AttitudeCheck:
 
 
 def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeCheck | None:
-    """Attitude from directions over the trajectory's span, compared; None without sensors or without an attitude."""
+    """Compute attitude from directions and compare it with the trajectory's; None without sensors or attitude."""
     if telemetry.magnetometer is None or telemetry.sun is None or bet.provenance["motion"] == "ballistic":
         return None
     settings = bet.settings

@@ -1,4 +1,4 @@
-"""What does a run leave? Tables, headers, summary in ``runs/<utc>-<hash8>[-<name>]/``, complete or not there at all.
+"""What does a run write? Tables, headers, summary in ``runs/<utc>-<hash8>[-<name>]/``, complete or not at all.
 
 The hash covers inputs, settings and version, so equal runs carry equal hashes, and the same inputs give the same bytes
 in every file but ``run.json``, which alone holds times and machine (and the report that shows the run's name).
@@ -140,7 +140,7 @@ class RunFolder(Results):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, _: object) -> None:
-        """Rename when whole or when answers are kept; remove otherwise, also where the end itself is interrupted."""
+        """Rename if complete or if answers are kept; remove otherwise, even if the renaming itself is interrupted."""
         partial, kept = self.path, self.finished is not None
         try:
             with writing(self.parent, _COPY):
@@ -162,7 +162,7 @@ class RunFolder(Results):
 
     @contextlib.contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Run what no answer depends on; if it is refused, say so in `left_out` and go on."""
+        """Run a step on which no answer depends; if it is refused, record that in `left_out` and go on."""
         try:
             yield
         except (GateError, DivergenceError) as fault:
@@ -224,7 +224,7 @@ def _lines(values: FloatArray) -> str:
 
 
 def _cells(column: pd.Series) -> list[Any]:
-    """A column's cells as `DataFrame.to_csv` with a float format writes them, which takes three times as long."""
+    """Cells of a column as `DataFrame.to_csv` with a float format writes them, in a third of the time."""
     if column.dtype == np.float64:
         values = column.to_numpy()
         return ["" if missing else DIGITS % x for x, missing in zip(values.tolist(), np.isnan(values), strict=True)]

@@ -1,4 +1,4 @@
-"""Which runs has a flight, which one is meant, and what did it write? Runs named, selected and read back.
+"""Which runs does a flight have, which one is selected, and what did it write? Runs named, selected and read back.
 
 A run is complete where every file is there that a later command reads; what `postflight deflection` and `postflight
 reconcile` leave is none, and what is being written, or was when its process was killed, bears a hidden name.
@@ -95,7 +95,7 @@ def changes_of(facts: dict[str, Any]) -> tuple[str, ...]:
 
 
 def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
-    """Return the last complete run, or the last that is meant by a word.
+    """Return the last complete run, or the last one that matches a word.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def find_run(flight_folder: Path, wanted: str | Path | None = None) -> Path:
 
 
 def _whole(flight_folder: Path, run: Path) -> Path:
-    """Return the folder of a run of this flight, or raise `GateError` with what it lacks."""
+    """Return the folder of a run of this flight, or raise `GateError` with its missing files."""
     if run.resolve().parent != (flight_folder / "runs").resolve():
         words = f"{run}: no run of {flight_folder}, whose runs lie in {flight_folder / 'runs'}"
         raise GateError(words, "run-missing")
@@ -182,7 +182,7 @@ class Run(Tabular):
 
     @property
     def hash8(self) -> str:
-        """What stands for inputs, settings and version in the folder's name."""
+        """Digits of the folder's name that identify inputs, settings and version."""
         return run_hash(self.facts["inputs_sha256"], self.facts["settings"], self.facts["version"])
 
     @property
@@ -356,7 +356,7 @@ class Run(Tabular):
 
 
 def _literal(text: str) -> Any:
-    """A value as Python writes it; what is none is a word."""
+    """Value in Python's notation; anything else is a string."""
     try:
         return ast.literal_eval(text)
     except (SyntaxError, ValueError):

@@ -44,7 +44,7 @@ PUBLISHED_DEG = {"irve2_reference": ("IRVE-II (paper)", {"camera": 4.2, "misalig
 
 
 class Quantity(NamedTuple):
-    """What is scored: its name in `SCORED`, its values in its unit (NaN for none), why it has no answer."""
+    """Scored quantity: its name in `SCORED`, values in its unit (NaN for none), and the reason if it has no answer."""
 
     name: str
     unit: str
@@ -56,7 +56,7 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """How large errors and standard deviations may be where the truth is recovered.
+    """Largest errors and standard deviations with which the truth counts as recovered.
 
     Parameters
     ----------

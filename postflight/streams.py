@@ -1,4 +1,4 @@
-"""How does text from files reach standard output? As text: it moves no cursor, turns no line round, ends no command.
+"""How does text from files reach standard output? Without control characters, and without failing on a closed stream.
 
 A name in a delivery may hold escape sequences that rewrite what stands above, or bidirectional marks that show a number
 backwards; a reader such as `head` may close its end of the pipe, a log may take ASCII only. Beside the streams of a
@@ -21,14 +21,14 @@ _R = TypeVar("_R")
 
 
 def visible(text: str) -> str:
-    """Text with ``?`` in place of every character that is not seen but does something."""
+    """Text with ``?`` in place of every invisible control or format character."""
     if text.isascii() and text.isprintable():
         return text
     return "".join("?" if unicodedata.category(c) in _HIDDEN and c not in _KEPT else c for c in text)
 
 
 def write_out(text: str, stream: TextIO | None = None) -> None:
-    """Write text to standard output, or another stream; nowhere if nobody reads."""
+    """Write text to standard output or another stream; discard it if the reader has gone."""
     stream = stream or sys.stdout
     try:
         stream.write(visible(text))
@@ -38,7 +38,7 @@ def write_out(text: str, stream: TextIO | None = None) -> None:
 
 
 def into_nothing(stream: Any) -> None:
-    """Send what a stream still holds, and all that follows, to the null device."""
+    """Redirect a stream's buffered and future output to the null device."""
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, stream.fileno())
     os.close(nothing)
@@ -60,7 +60,7 @@ def open_streams() -> None:
 
 
 def close_streams() -> None:
-    """Write what is still held; a reader that has gone is no fault."""
+    """Flush buffered output; a closed pipe is not an error."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -1,4 +1,4 @@
-"""By what do two trajectories of one flight differ: a clock, a datum, a frame, or by what their covariances allow?
+"""How do two trajectories of one flight differ: by a clock, a datum, a frame, or within their covariances?
 
 Another source's states are compared with the run at the other's own times; only the run is interpolated. Difference
 is other minus run, position and velocity in north, east, down at the run's place, rotation in body axes. It is
@@ -278,7 +278,7 @@ def _with_rates(run: Trajectory) -> Trajectory:
 
 
 def _with_datum(best: _Explained, datum: _Fit) -> _Explained:
-    """The likelier of the effects found and of those by heights above the geoid."""
+    """Return the likelier set: the effects found, or those with heights above the geoid."""
     # one by one from the start, and those found without it: neither way of choosing must speak for or against the datum
     with_shift, no_shift = (*best.names, "shift"), tuple(name for name in best.names if name != "shift")
     sets = (datum.explained(), *(datum.solved(tuple(dict.fromkeys(names))) for names in (with_shift, no_shift)))
@@ -290,7 +290,7 @@ def _with_datum(best: _Explained, datum: _Fit) -> _Explained:
 
 
 def _covered(run: Trajectory, time_s: FloatArray, offset_s: float) -> BoolArray:
-    """Times that the run covers when they are moved by an offset, and by a margin more to both sides."""
+    """Mask of times that, shifted by an offset, the run covers with a margin on both sides."""
     margin = _MARGIN_S + 2.0 * _EFFECTS["time-offset"][3]  # derivatives step beyond it
     return np.asarray(
         (time_s - offset_s >= run.time_s[0] + margin) & (time_s - offset_s <= run.time_s[-1] - margin), dtype=bool
@@ -298,7 +298,7 @@ def _covered(run: Trajectory, time_s: FloatArray, offset_s: float) -> BoolArray:
 
 
 def _far_offset(run: Trajectory, other: OtherTrajectory) -> list[float]:
-    """Time offset at which the two tracks have one form, where that is far from none and far better."""
+    """Time offset at which both tracks have the same shape, if it is far from zero and fits far better."""
     offsets = np.arange(-_FAR_S, _FAR_S + _FAR_STEP_S, _FAR_STEP_S)
     scatter = np.full(len(offsets), np.inf)
     few = np.unique(np.linspace(0, len(other.time_s) - 1, 300).astype(int))
@@ -415,7 +415,7 @@ class _Fit:
     # which effects
 
     def explained(self) -> _Explained:
-        """The effects that the difference bears, added one by one and dropped where others have made them needless."""
+        """Effects selected one by one; an effect is dropped if others make it unnecessary."""
         current = self.solved(("time-offset",) if self.start_s else ())
         while len(current.names) < len(self.names):
             more = [(*current.names, name) for name in self.names if name not in current.names]
@@ -435,7 +435,7 @@ class _Fit:
         return current
 
     def _possible(self, fit: _Explained) -> bool:
-        """Whether inertial velocity, if it is among the effects, has its size."""
+        """Whether an inertial-velocity effect, if it is in the set, has a factor consistent with one."""
         if "inertial-velocity" not in fit.names:
             return True
         at = self.slices["inertial-velocity"]
@@ -478,7 +478,7 @@ def _least_squares(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Noise:
-    """Residuals (n, m): variance of each component and how many of n are independent."""
+    """Noise of residuals (n, m): variance of each component and number of independent ones among n."""
 
     variance: FloatArray
     inefficiency: FloatArray
@@ -503,7 +503,7 @@ class _Noise:
 
 @dataclass(frozen=True)
 class _Explained:
-    """A set of effects, solved."""
+    """Solution for a set of effects."""
 
     fit: _Fit
     names: tuple[str, ...]
@@ -548,7 +548,7 @@ class _Explained:
 
 
 def _shift_odds(one: _Explained, other: _Explained) -> float:
-    """Log odds of the size of the shift that one set of effects leaves, over that of another; no shift is one of zero.
+    """Log odds of the shift's size in one set of effects over that in another; a set without one has size zero.
 
     What both covariances allow is the largest scale of a shift; two files of one solution differ by far less. So its
     scale is any from a thousandth of that on, evenly in its logarithm.
@@ -585,19 +585,19 @@ def _stated(fit: _Fit) -> tuple[FloatArray, ...]:
 
 @dataclass(frozen=True)
 class _Allowed:
-    """What errors with the stated covariances can make of one effect: covariance (p, p), and the effect's size."""
+    """Effect that errors with the stated covariances can produce: covariance (p, p), and the size of the one found."""
 
     covariance: FloatArray
     size: float
 
     @property
     def size_in_limit(self) -> float:
-        """Size over that which one flight in 1000 exceeds."""
+        """Size over the one exceeded in one flight in 1000."""
         return self.size / _most_size(len(self.covariance))
 
     @classmethod
     def of(cls, found: _Explained, name: str) -> _Allowed:
-        """By the weights that show this effect best, while the others that were found are unknown."""
+        """Bound with the epoch weights that determine this effect best, while the other effects are free."""
         fit, noise = found.fit, found.noise
         asked = np.concatenate([np.full(len(_EFFECTS[n][0]), n == name) for n in fit.names if n in found.names])
         unit = np.sqrt((found.slope**2 / noise.variance[:, None]).mean(axis=(0, 1)))  # brings all columns to one size
@@ -615,12 +615,12 @@ class _Allowed:
 
 
 def _size_of_last(found: _Explained) -> float:
-    """Size, over what the covariances allow, of the effect that was added last."""
+    """Size of the effect added last, over what the covariances allow."""
     return _Allowed.of(found, found.names[-1]).size_in_limit
 
 
 def _most_size(count: int) -> float:
-    """Size of an effect with so many components that one flight in 1000 exceeds."""
+    """Size that an effect with so many components exceeds in one flight in 1000."""
     return float(np.sqrt(chi_square_quantile(_CONFIDENCE, count)))
 
 

@@ -52,7 +52,7 @@ class Terminal(Console):
         self.print(printed)
 
     def on_broken_pipe(self) -> None:
-        """Go on: results are written to files, whoever reads."""
+        """Continue after a closed pipe, since results are written to files."""
         into_nothing(self.file)
 
 
@@ -65,7 +65,7 @@ MOST_ALIKE = 5  # findings of one kind that a reader wants line by line
 
 
 def few_of_each(findings: Iterable[Issue]) -> list[tuple[str, str]]:
-    """Words and code of findings; of many of one source and code the first, and how many more there are, until when."""
+    """Text and code of findings; of many with one source and code, the first, their number and their end."""
     alike: dict[tuple[str, str], list[Issue]] = {}
     for finding in findings:
         alike.setdefault((finding.source, finding.code), []).append(finding)

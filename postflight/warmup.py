@@ -63,7 +63,7 @@ def _ensembles() -> None:
 
 
 def _creep() -> None:
-    """Of what a joint that creeps adds a reconciliation asks in every flight."""
+    """Compile the simulator's kernels with creep states, which every reconciliation uses."""
     from synthetic_flight.dynamics import CREEP_STATES
 
     _fly_ensemble(CREEP_STATES)
@@ -184,7 +184,7 @@ RECONSTRUCTION, ESTIMATES = ("filter", "smoothers"), ("balance", "camera")
 
 
 def _stamp(group: str) -> Path | None:
-    """Mark of a compiled group. numba keeps compiled code by the sources' location, and so does the mark."""
+    """Marker of a compiled group; like numba's cache, it depends on the location of the sources."""
     if CACHE.path is None:
         return None
     location = hashlib.sha256(str(Path(earth.__file__).parent).encode()).hexdigest()[:8]
@@ -243,7 +243,7 @@ def _seconds(group: str) -> float:
 
 
 class _Watch:
-    """How far compiling is, by the groups whose mark is there and the time since it became a group's turn."""
+    """Progress of compiling, from the groups whose marker exists and the time since each group's turn began."""
 
     def __init__(self, shares: list[list[str]]) -> None:
         self._shares = shares
@@ -251,7 +251,7 @@ class _Watch:
         self._since: dict[str, float] = {}
 
     def look(self) -> tuple[float, str]:
-        """Part of the time that is over, and groups in work, of how many, with an estimate of what remains."""
+        """Elapsed fraction of the time, and the groups in work, of how many, with an estimate of the remaining time."""
         now = time.monotonic()
         left = [missing(share) for share in self._shares]
         turn = [share[0] for share in left if share][: len(os.sched_getaffinity(0))]
@@ -276,7 +276,7 @@ def _compile(groups: list[str]) -> dict[str, str]:
 
 
 def _with_room(work: Callable[[list[str]], dict[str, str]]) -> Callable[[list[str]], dict[str, str]]:
-    """Work in a frame that claims `_FRAME_SLOTS`, so that CPython asks for the frames of its callees at once.
+    """Run work in a frame that claims `_FRAME_SLOTS`, so that CPython allocates its callees' frames at once.
 
     CPython keeps frames in pieces of 16 KiB and gives a piece back at every return across its edge. A compiler recurses
     to and fro across an edge a million times: a seventh of the time.

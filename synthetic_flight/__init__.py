@@ -1,3 +1,3 @@
-"""A flight that everything is known about: two bodies on a compliant joint, and the instruments that watched them."""
+"""Synthetic flight with known truth: two bodies on a compliant joint, and the instruments that observe them."""
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class Shift(Section):
     uniform: tuple[Number, Number] | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
             names = ", ".join(type(self).model_fields)
@@ -47,29 +47,29 @@ class Shift(Section):
             yield "uniform", list(self.uniform), "a lower and a higher bound are wanted"
 
     def at(self, u: float) -> float:
-        """Deviation of which the fraction ``u`` of all draws lies below."""
+        """Deviation at the cumulative probability ``u``."""
         if self.uniform is not None:
             return self.uniform[0] + (self.uniform[1] - self.uniform[0]) * u
         return float((self.normal or 0.0) * ndtri(u))
 
 
 class Factor(Shift):
-    """Relative deviation, a factor less one: normal, uniform, or of a lognormal factor."""
+    """Relative deviation (factor minus one): normal, uniform, or that of a lognormal factor."""
 
     lognormal: NonNegative | None = None
 
     def at(self, u: float) -> float:
-        """Deviation of which the fraction ``u`` of all draws lies below."""
+        """Deviation at the cumulative probability ``u``."""
         return float(np.expm1(self.lognormal * ndtri(u))) if self.lognormal is not None else super().at(u)
 
 
 @with_keys(dict.fromkeys(Initial.model_fields, (Shift | None, None)))
 class InitialDispersions(Section):
-    """Of the state at the start of the scenario; keys and units are the scenario's own."""
+    """Dispersions of the state at the start of the scenario; keys and units are the scenario's own."""
 
 
 class MassDispersions(Section):
-    """Of the two bodies; a station grows aft, the offset is that of the vehicle's c.g., carried by the centerbody."""
+    """Dispersions of both bodies; stations are positive aft, the centerbody carries the vehicle's c.g. offset."""
 
     aeroshell_mass: Factor | None = None
     centerbody_mass: Factor | None = None
@@ -82,7 +82,7 @@ class MassDispersions(Section):
 
 
 class AeroDispersions(Section):
-    """Of the coefficients: factors on C_A, C_N and C_m, a shift of C_mq."""
+    """Dispersions of the aerodynamic coefficients: factors on C_A, C_N and C_m, a shift of C_mq."""
 
     ca: Factor | None = None
     cn: Factor | None = None
@@ -91,7 +91,7 @@ class AeroDispersions(Section):
 
 
 class JointDispersions(Section):
-    """Of the joint."""
+    """Dispersions of the joint."""
 
     stiffness: Factor | None = None
     damping: Factor | None = None
@@ -104,7 +104,7 @@ class JointDispersions(Section):
 
 
 class AirDispersions(Section):
-    """Of the atmosphere: a day for every flight or one for all, a factor on the density, a wind at all altitudes."""
+    """Dispersions of the atmosphere: one day per flight or one for all, a density factor, a wind at all altitudes."""
 
     day: bool = True
     density: Factor | None = None
@@ -125,7 +125,7 @@ class Window(Section):
     history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         if not self.from_s < self.to_s:
             yield "to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"
         ratio = self.history_s / self.record_s
@@ -136,12 +136,12 @@ class Window(Section):
 
     @property
     def records(self) -> int:
-        """Records of a whole flight through the window, its first one at ``from_s``."""
+        """Number of records of a flight through the window, the first one at ``from_s``."""
         return int(np.floor((self.to_s - self.from_s) / self.record_s + 1e-6)) + 1
 
     @property
     def per_history(self) -> int:
-        """Records from one point of a history to the next."""
+        """Number of records between two points of a history."""
         return round(self.history_s / self.record_s)
 
     def history_time_s(self) -> FloatArray:
@@ -150,7 +150,7 @@ class Window(Section):
 
 
 class Dispersions(Section):
-    """What varies from flight to flight."""
+    """Dispersed quantities of a Monte Carlo study, with their distributions."""
 
     joint_is: Literal["flexible", "locked"] = "flexible"
     initial: InitialDispersions = InitialDispersions()
@@ -185,12 +185,12 @@ def draw_one(seed: int, run: int, name: str) -> float:
 
 
 def run_seed(seed: int, run: int) -> int:
-    """Return the seed of all that one run draws beside its factors: its atmosphere and its instruments."""
+    """Return the seed of one run's atmosphere and instruments, which are drawn apart from its factors."""
     return int(np.random.SeedSequence(seed, spawn_key=(run,)).generate_state(1, np.uint64)[0] >> 1)
 
 
 def rng_from_draw(u: float) -> np.random.Generator:
-    """Return the generator of a factor that is a whole profile."""
+    """Return the random generator of a factor that is a whole profile."""
     return np.random.default_rng(np.random.SeedSequence(int(u * 2.0**53)))
 
 
@@ -250,7 +250,7 @@ def dispersed_scales(of: Callable[[str], float]) -> tuple[float, float, float, f
 
 
 def dispersed_vehicle(vehicle: Vehicle, of: Callable[[str], float]) -> Vehicle:
-    """Vehicle with the deviations that ``of`` gives by the factor's name; coefficients unchanged."""
+    """Vehicle with mass and joint deviations, each given by ``of`` from the factor's name; coefficients unchanged."""
     body, shell, joint = vehicle.centerbody, vehicle.aeroshell, vehicle.joint
     # the offset is the whole vehicle's, the centerbody carries it
     carried = (vehicle.mass_kg / body.mass_kg) * np.array([0.0, of("mass.offset_y_m"), of("mass.offset_z_m")])

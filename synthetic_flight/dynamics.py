@@ -276,7 +276,7 @@ def _wrench(s, w, i):
 
 @inlined
 def _terms(s, lanes):
-    """Add to force and moment on the shell what `flightmodel.vehicle.AeroTerms` says beyond the table."""
+    """Add the `flightmodel.vehicle.AeroTerms` beyond the coefficient table to force and moment on the shell."""
     w = len(lanes)
     for i in range(w):
         _, v, z = _three(s, FLOW, w, i)
@@ -376,7 +376,7 @@ def _joint(s, lanes):
 
 @inlined
 def _creep(s, lanes):
-    """Joint's moment with creep in place of that without, and the creep's rate.
+    """Replace the joint's moment without creep by that with creep, and compute the creep's rate.
 
     Spring and a Kelvin element in series: of the deflection ``e`` (shell axes y and z of the body's x axis, as long as
     the angle) the spring feels ``e - b``, and ``b' = (k F - b) / tau`` with the spring's force ``F`` and the delayed
@@ -448,7 +448,7 @@ def _joined(s, lanes):
 
 @inlined
 def _slow_twist(s, lanes):
-    """Accelerations, joint's force and moment with the added inertia of the twist, from those without.
+    """Correct accelerations and the joint's force and moment for the inertia added to the twist.
 
     The twist changes at ``p' = w n / (1 + x)``, with ``w`` the body's rate less the shell's, ``x y z`` the body's x
     axis (shell axes) and ``n = (1 + x, y, z)``; the torsion ``T n / (1 + x)`` does the work ``T p'``. An inertia of the
@@ -546,7 +546,7 @@ def _rigid(s, lanes):
 
 @inlined
 def rates(s, lanes, creep, terms, atmosphere, grid, mach_knots, table, free, planet, locked, slowed):
-    """Time derivative of the trial state of every lane, and what is recorded.
+    """Time derivative of every lane's trial state, and the recorded auxiliary quantities.
 
     Whether ``terms`` is empty is a constant of the compiler, as for ``creep``.
     """
@@ -612,7 +612,7 @@ def _advance(s, w, stage, step):
 
 @inlined
 def _advance_creep(s, w, creep, stage, step):
-    """`_advance` of the creep: with one function for both, rows as arguments, ensembles take a quarter longer."""
+    """`_advance` of the creep states; one shared function with rows as arguments would slow ensembles by a quarter."""
     n, ahead, share = len(creep) * w, step * (1.0 if stage == 2 else 0.5), step / (6.0 if stage == 0 else 3.0)
     for k in range(CREEP * w, CREEP * w + n):
         s[k + 3 * n] = (s[k] if stage == 0 else s[k + 3 * n]) + share * s[k + 2 * n]
@@ -630,7 +630,7 @@ def _finish_creep(s, w, creep, step):
 
 @inlined
 def _finish(s, w, step):
-    """After the last stage: the new state, quaternions of length one, and the trial state equal to it."""
+    """Finish an RK4 step: new state with unit quaternions, and the trial state set equal to it."""
     for k in range(STATES * w):
         s[Y * w + k] = s[NEXT * w + k] + step / 6.0 * s[RATE * w + k]
     for row in (Y + 6, Y + 10):
@@ -727,7 +727,7 @@ def deflection_angle(q_eci_body: FloatArray, q_eci_shell: FloatArray) -> tuple[F
 
 
 def twist(q_eci_body: FloatArray, q_eci_shell: FloatArray) -> FloatArray:
-    """Twist of body against shell about x, rad, beyond the shortest rotation of one x axis onto the other."""
+    """Twist of body against shell about x, rad, beyond the shortest rotation that aligns both x axes."""
     q = rotations.multiply(rotations.conjugate(q_eci_shell), q_eci_body)
     angle = 2.0 * np.arctan2(q[..., 1], q[..., 0])
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
@@ -837,7 +837,7 @@ def joint_modes(vehicle: Vehicle) -> dict[str, tuple[float, float, float]]:
 
 
 def added_twist_inertia(inertia: FloatArray, damping: FloatArray, stiffness: FloatArray, step_s: float) -> FloatArray:
-    """Least inertia, kg m^2, that brings a twist's roots within 2 / step; zero where they are.
+    """Smallest added inertia, kg m^2, that brings the twist's roots within 2 / step; zero if they already are.
 
     The roots of ``I s^2 + C s + K`` lie within a circle of radius s where ``I s^2 >= K`` and ``I s^2 - C s + K >= 0``.
     """
@@ -873,7 +873,7 @@ def resolving_step_s(vehicle: Vehicle) -> float:
 
 
 def check_resolved(vehicle: Vehicle, step_s: float) -> None:
-    """Refuse a step that blurs the joint's oscillation; `ConfigError` says the longest that does not."""
+    """Raise `ConfigError`, with the longest valid step, if the step does not resolve the joint's oscillation."""
     inertia, _, stiffness = joint_modes(vehicle)["bending"]
     longest = resolving_step_s(vehicle)
     if step_s > longest:
@@ -885,7 +885,7 @@ def check_resolved(vehicle: Vehicle, step_s: float) -> None:
 
 
 def check_step(vehicle: Vehicle, step_s: float) -> None:
-    """Refuse a step at which the joint's bending is unstable; `ConfigError` says the longest step.
+    """Raise `ConfigError`, with the longest valid step, if the joint's bending is unstable at this step.
 
     A step too long for the twist is not refused: `added_twist_inertia`.
     """

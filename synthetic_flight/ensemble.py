@@ -60,7 +60,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Flown:
-    """One flight of an ensemble: its records; fewer than asked for where the joint diverged, which ``diverged`` says.
+    """One flown flight of an ensemble: its records, fewer than asked for if the joint ``diverged``.
 
     ``states`` ``(n, 20)`` and ``aux`` ``(n, 18)`` as `synthetic_flight.simulate.integrate` gives them.
     """
@@ -170,12 +170,12 @@ _TABLE_M = simulate.air_altitudes_m()
 
 
 def _turned(dcm: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) by matrices (n, 3, 3)."""
+    """Product of matrices (n, 3, 3) and vectors (n, 3)."""
     return np.einsum("nij,nj->ni", dcm, vectors)
 
 
 def _turned_back(dcm: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) by the transposes of matrices (n, 3, 3)."""
+    """Product of transposed matrices (n, 3, 3) and vectors (n, 3)."""
     return np.einsum("nji,nj->ni", dcm, vectors)
 
 
@@ -195,7 +195,7 @@ class Records:
 
     @cached_property
     def specific_force_body_mps2(self) -> FloatArray:
-        """Of the centerbody's point at the undeflected vehicle's c.g., ``(n, 3)``, body axes.
+        """Specific force ``(n, 3)``, body axes, of the centerbody at the undeflected vehicle's c.g.
 
         Joint force over mass, moved there by lever-arm terms; the difference of gravitation over half a metre (1e-6
         m/s^2) is neglected.
@@ -212,7 +212,7 @@ class Records:
 
     @cached_property
     def velocity_air_body_mps(self) -> FloatArray:
-        """Velocity of that point relative to the air, ``(n, 3)``, body axes."""
+        """Velocity ``(n, 3)``, body axes, of the centerbody relative to the air at the undeflected vehicle's c.g."""
         position, velocity, _, _, rate, shell_rate = dynamics.split(self.states)
         vehicle, to_eci, shell_to_eci = self.vehicle, self._eci_from_body, rotations.dcm_from_q(self.states[:, 10:14])
         # the point lies where the vehicle's c.g. would if the shell, too, had the body's attitude
@@ -293,7 +293,7 @@ def _histories_of(records: Records, names: tuple[str, ...], window: Window) -> F
 
 
 def records_of(flown: Flown, vehicle: Vehicle, atmosphere: FloatArray) -> Records:
-    """Return what a flight recorded; `GateError` where it did not reach its window."""
+    """Return the records of a flight; `GateError` if it did not reach its window."""
     if not len(flown.aux):
         raise GateError("no record: the joint diverged, or the state was not finite, before the window", "too-few-data")
     return Records(flown.states, flown.aux, vehicle, atmosphere)
@@ -305,7 +305,7 @@ LOCKED_STEP_S = 0.02
 
 @dataclass(frozen=True)
 class Plan:
-    """What every flight of a study shares: scenario, dispersions, window, and what is kept."""
+    """Settings that all flights of a study share: scenario, dispersions, window, and outputs to keep."""
 
     scenario: Scenario
     dispersions: Dispersions
@@ -316,7 +316,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Row:
-    """What is kept of one flight; ``reason`` says why there is nothing, ``diverged_s`` when its joint passed 90 deg."""
+    """Outputs of one flight; ``reason`` says why there are none, ``diverged_s`` when its joint passed 90 deg."""
 
     run: int
     reason: Issue
@@ -355,7 +355,7 @@ def legs(time: TimeSpan, window: Window, locked: bool) -> list[Schedule]:
 
 
 def start_of(case: Case, step_s: float, locked: bool) -> Start:
-    """Start of a case in the lanes; `GateError` where the step is too long for its joint."""
+    """Initial state of a case in the lanes; `GateError` if the step is too long for its joint."""
     if not locked:
         check_step(case.vehicle, step_s)
     parameters = simulate.parameter_vector(case.vehicle, *case.scales)
@@ -363,7 +363,7 @@ def start_of(case: Case, step_s: float, locked: bool) -> Start:
 
 
 def fly_runs(plan: Plan, runs: Sequence[int], draws_of: Callable[[int], dict[str, float]]) -> list[Row]:
-    """Fly runs and keep what the plan asks for, in their order.
+    """Fly runs and return the outputs that the plan asks for, in the order of the runs.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ def fly_runs(plan: Plan, runs: Sequence[int], draws_of: Callable[[int], dict[str
 
 
 def failure_reason(fault: Exception) -> Issue:
-    """Return why a flight failed: message and code of a refusal, the message of any other exception with its type."""
+    """Return why a flight failed: message and code of a refusal, else type and message of the exception."""
     if isinstance(fault, GateError):
         return Issue(str(fault), fault.codes[0])
     return Issue(f"{type(fault).__name__}: {fault}")

@@ -95,11 +95,11 @@ class Warp:
     sine_3_rad: float = 0.0
 
     def plus(self, other: Warp) -> Warp:
-        """Return both together."""
+        """Return the sum of two warps."""
         return Warp(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
     def times(self, load: float) -> Warp:
-        """Return the warp under a share of the load."""
+        """Return the warp scaled to a fraction of the load."""
         return Warp(*(load * part for part in astuple(self)))
 
 
@@ -119,7 +119,7 @@ class Background:
 
 
 class ShellRenderer:
-    """Ray caster for one camera and one shell; holds what does not change from frame to frame.
+    """Ray caster for one camera and one shell; caches what is constant over the frames.
 
     Parameters
     ----------
@@ -159,14 +159,14 @@ class ShellRenderer:
         self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray,
         warp: Warp | None = None, background: Background | None = None,
     ) -> Float32:  # fmt: skip
-        """Scene radiance ``(h, w)`` before errors of lens and sensor; one is full scale. Threads may ask at once."""
+        """Scene radiance ``(h, w)`` before lens and sensor errors; one is full scale. Thread-safe."""
         cover, shade, body = self.seen(theta_rad, plane_lv_rad, sun_direction_body, warp)
         behind = self.sky if background is None else np.maximum(self.sky, self._earth(background))
         return np.asarray(np.where(self.is_clear, cover * shade + (1.0 - cover) * behind, body), dtype=np.float32)
 
     @cached_property
     def _fine(self) -> tuple[Camera, Float32]:
-        """The camera with samples for pixels, and their rays (h, w, 3)."""
+        """Camera with one pixel per sample, and its rays (h, w, 3)."""
         fine = self.camera.sampled(_SAMPLES)
         v, u = np.indices((fine.height_px, fine.width_px), dtype=float)
         rays = fine.rays_body(np.column_stack([u.ravel(), v.ravel()])).astype(np.float32)
@@ -191,7 +191,7 @@ class ShellRenderer:
     def seen(
         self, theta_rad: float, plane_lv_rad: float, sun_direction_body: FloatArray, warp: Warp | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Share of each pixel that the shell covers, radiance of the shell and of the centerbody, ``(h, w)`` each."""
+        """Fraction of each pixel covered by the shell, radiance of shell and of centerbody, ``(h, w)`` each."""
         rotation = rotation_vector_body_shell(np.array(theta_rad), np.array(plane_lv_rad))
         turn = rotations.dcm_from_q(rotations.exp(-rotation))
         sun_body, geometry = np.asarray(sun_direction_body, dtype=float), self.geometry
@@ -207,7 +207,7 @@ class ShellRenderer:
         return self._cover(in_shell, depth, shade), shade, self._centerbody_shade(sun_body, in_shell)
 
     def _sun_seen(self, depth: FloatArray, in_shell: _InShell) -> FloatArray:
-        """Share (h, w) of the Sun's disc where four pixels around, of every other row and column, agree; else NaN.
+        """Visible fraction (h, w) of the Sun's disc where four pixels of a half-resolution grid agree, else NaN.
 
         Shadows narrower than two pixels may be missed.
         """
@@ -225,7 +225,7 @@ class ShellRenderer:
         return free
 
     def _shade(self, rays: FloatArray, depth: FloatArray, free: FloatArray, in_shell: _InShell) -> FloatArray:
-        """Radiance of the skin that rays (..., 3) meet at depths; ``free``, the Sun's share, is completed where NaN."""
+        """Radiance of the skin met by rays (..., 3) at depths; fills in NaN in ``free``, the Sun's visible fraction."""
         turn, eye, sun, shell, warp, body = in_shell
         shade, flat = np.empty(depth.shape), rays.reshape(-1, 3)
         see_sun(flat, depth.ravel(), turn, eye, sun, shell, warp, body, free.ravel())
@@ -233,7 +233,7 @@ class ShellRenderer:
         return shade
 
     def _cover(self, in_shell: _InShell, depth: FloatArray, shade: FloatArray) -> FloatArray:
-        """Share (h, w) of each pixel that the shell covers; ``shade`` is completed where a pixel's middle misses it."""
+        """Fraction (h, w) of each pixel covered by the shell; fills in ``shade`` where the pixel's centre misses it."""
         hit = np.isfinite(depth).astype(np.uint8)
         kernel = np.ones((7, 7), np.uint8)
         v, u = np.nonzero((cv2.dilate(hit, kernel) != cv2.erode(hit, kernel)) & self.is_clear)
@@ -296,7 +296,7 @@ _InShell = tuple[FloatArray, FloatArray, FloatArray, tuple[float, ...], tuple[fl
 
 
 def shell_terms(geometry: ShellGeometry) -> tuple[float, ...]:
-    """The stack of tori as the kernels take it."""
+    """Parameters of the stack of tori, packed for the kernels."""
     station, radius = torus_circles(geometry)
     half = np.deg2rad(geometry.half_angle_deg)
     farthest_m = max(FARTHEST_M, FARTHEST_RADII * geometry.base_radius_m)
@@ -306,13 +306,13 @@ def shell_terms(geometry: ShellGeometry) -> tuple[float, ...]:
 
 
 def warp_terms(warp: Warp | None) -> tuple[float, ...]:
-    """A departure from the nominal shape as the kernels take it."""
+    """Parameters of a departure from the nominal shape, packed for the kernels."""
     return (*astuple(warp or Warp()), float(warp is not None))
 
 
 @inlined
 def _half_plane(x, y, z, shell, warp):
-    """Along the generator from the nearest torus's centre, aft of the generator, and the radius, m."""
+    """Distances along the generator from the nearest torus's centre and aft of the generator, and the radius, m."""
     r = math.sqrt(y * y + z * z)
     aft, out = -x - shell[0], r - shell[1]
     if warp[5] != 0.0:
@@ -336,16 +336,16 @@ def _gap(eye, dx, dy, dz, t, shell, warp):
 
 @inlined
 def _thickness(shell, warp):
-    """How far the stack reaches aft of its generator, m, out of shape as it may be."""
+    """Largest distance of the stack's skin aft of its generator, m, with its departure from shape."""
     bent = abs(warp[0]) + abs(warp[1]) + abs(warp[2]) + abs(warp[3]) + abs(warp[4])
     return shell[5] + 0.02 + bent * (shell[6] * shell[4] + 2.0 * shell[5])
 
 
 @inlined
 def _way_to_stack(x, y, z, dx, dy, dz, shell, warp):
-    """Way along a direction, m, in which nothing is met, of a point aft of the stack, inside the cone that encloses it.
+    """Free distance along a ray, m, from a point aft of the stack to the cone that encloses the stack.
 
-    It ends where that cone is met, and is infinite where it is not; zero for a point elsewhere.
+    Infinite if the ray does not meet that cone; zero for a point elsewhere.
     """
     r = math.sqrt(y * y + z * z)
     above = shell[3] * (-x - shell[0]) - shell[2] * (r - shell[1]) - _thickness(shell, warp)
@@ -399,7 +399,7 @@ def _march(eye, d, pixel, lanes, depth, shell, warp):
 
 @inlined
 def _beside_body(x, y, z, sun, body):
-    """Share of the Sun's disc that the centerbody leaves free."""
+    """Fraction of the Sun's disc not hidden by the centerbody."""
     nose, aft, radius, length = body
     px, py, pz = x - nose[0], y - nose[1], z - nose[2]
     at, climb = px * aft[0] + py * aft[1] + pz * aft[2], sun[0] * aft[0] + sun[1] * aft[1] + sun[2] * aft[2]
@@ -423,9 +423,9 @@ def _beside_body(x, y, z, sun, body):
 
 @inlined
 def _beside_shell(points, pixel, lanes, sun, shell, warp, free):
-    """Multiply ``free`` at places ``pixel`` (n,) by the share of the Sun's disc that the tori leave free.
+    """Multiply ``free`` at pixels ``pixel`` (n,) by the fraction of the Sun's disc not hidden by the tori.
 
-    Seen from points (3, n) off their skin; the points, ``pixel`` and ``lanes`` are used up as by `_march`.
+    The points (3, n) lie off the tori's skin; the points, ``pixel`` and ``lanes`` are used up as by `_march`.
     """
     x, y, z = points
     t, share, _ = lanes
@@ -476,7 +476,7 @@ def _normal(y, z, a, b, r, shell):
 
 @inlined
 def _shade(eye, d, t, free, sun, shell, warp, painted):
-    """Radiance of the skin at depth ``t`` along a ray, of which a share of the Sun's disc is seen."""
+    """Radiance of the skin at depth ``t`` along a ray, with the given fraction of the Sun's disc visible."""
     y, z = eye[1] + t * d[1], eye[2] + t * d[2]
     a, b, r = _half_plane(eye[0] + t * d[0], y, z, shell, warp)
     crest = min(max(b / shell[5], 0.0), 1.0)
@@ -510,7 +510,7 @@ def cast(rays, clear, turn, eye, shell, warp, depth):
 
 @kernel
 def closest(rays, near, turn, eye, shell, warp, gap, depth):
-    """Where rays (n, 3) come closest to the shell, beginning from depths near it: distance and depth, m."""
+    """Distance and depth, m, at the closest approach of rays (n, 3) to the shell, starting from depths nearby."""
     d = np.empty(3)
     step = 0.03
     for i in range(len(rays)):
@@ -528,7 +528,7 @@ def closest(rays, near, turn, eye, shell, warp, gap, depth):
 
 @kernel
 def see_sun(rays, depth, turn, eye, sun, shell, warp, body, free):
-    """Share (n,) of the Sun's disc that is seen from where rays (n, 3) meet the skin; found where it is NaN."""
+    """Fill in NaN in ``free`` (n,): visible fraction of the Sun's disc where rays (n, 3) meet the skin."""
     points, pixel, lanes = np.empty((3, LANES)), np.empty(LANES, dtype=np.int64), np.empty((3, LANES))
     d = np.empty(3)
     for begin in range(0, len(rays), LANES):
@@ -552,7 +552,7 @@ def see_sun(rays, depth, turn, eye, sun, shell, warp, body, free):
 
 @kernel
 def shade_shell(rays, depth, free, turn, eye, sun, shell, warp, painted, shade):
-    """Radiance (n,) of the skin that rays (n, 3) meet, of shares ``free`` (n,) of the Sun's disc; zero where none."""
+    """Radiance (n,) of the skin met by rays (n, 3), zero for a miss; ``free`` (n,): visible fraction of the Sun."""
     d = np.empty(3)
     for k in range(len(rays)):
         shade[k] = 0.0
@@ -563,7 +563,7 @@ def shade_shell(rays, depth, free, turn, eye, sun, shell, warp, painted, shade):
 
 @kernel
 def shade_mesh(points, normals, sun, shell, body, painted, shadows, shade):
-    """Radiance (n,) at points (n, 3) of a mesh, on the unbent shell; the centerbody alone shades it."""
+    """Radiance (n,) at points (n, 3) of a mesh on the undeformed shell, shaded by the centerbody alone."""
     for i in range(len(points)):
         x, y, z = points[i]
         nx, ny, nz = normals[i]
@@ -578,14 +578,14 @@ def shade_mesh(points, normals, sun, shell, body, painted, shadows, shade):
 
 @kernel
 def sunlit(points, sun, shell, warp, share):
-    """Share (n,) of the Sun's disc that the tori leave free at points (n, 3) off them."""
+    """Fraction (n,) of the Sun's disc not hidden by the tori, at points (n, 3) off their skin."""
     n = len(points)
     share[:] = 1.0
     _beside_shell(points.T.copy(), np.arange(n), np.empty((3, n)), sun, shell, warp, share)
 
 
 def warped(points_shell_m: FloatArray, warp: Warp | None, geometry: ShellGeometry) -> FloatArray:
-    """Points ``(n, 3)`` of the shell out of shape: turned about the innermost ring in their half-planes."""
+    """Points ``(n, 3)`` of the deformed shell: rotated about the innermost ring in their half-planes."""
     if warp is None:
         return points_shell_m
     station, radius = (float(c[0]) for c in torus_circles(geometry))
@@ -678,7 +678,7 @@ class Imaging:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the camera has before it, frame by frame.
+    """Scene in front of the camera, frame by frame.
 
     Parameters
     ----------
@@ -812,7 +812,7 @@ def film(
 
 
 def _ahead(make: Callable[[int], Float32], count: int) -> Iterator[Float32]:
-    """What is made of 0, 1, ..., in this order, a few ahead in threads: numpy's arithmetic runs beside Python."""
+    """Yield ``make(0)``, ``make(1)``, ... in order, computed a few ahead in threads."""
     threads = available_cores()
     waiting: deque[Future[Float32]] = deque()
     with ThreadPoolExecutor(threads) as pool:
@@ -888,7 +888,7 @@ def _write_video(
     report: Progress,
     shape_rng: np.random.Generator | None = None,
 ) -> None:
-    """Images in a folder or one film of a name, and the list of frames with their times, below a folder."""
+    """Write a video, as images in a folder or as one film, and its list of frame times, below a folder."""
     vehicle, (telemetry, name, listed) = scenario.vehicle, place
     rng = child_rng(seed, spec.camera)
     at = sensing.sample_times(spec.start_s, min(spec.stop_s, float(truth.time_s[-1])), spec.rate_hz)
@@ -930,7 +930,7 @@ def _imaging_from_quality(quality: FilmQuality) -> Imaging:
 
 
 def scene(truth: Truth, at_s: FloatArray, with_earth: bool) -> Scene:
-    """What the camera has before it at times ``(n,)``."""
+    """Scene in front of the camera at times ``(n,)``."""
     yz = np.column_stack([np.interp(at_s, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])
     step = 0.005
     ends = [np.column_stack([np.interp(at_s + d, truth.time_s, c) for c in truth.deflection.theta_yz_rad.T])

@@ -101,7 +101,7 @@ def _check_telemetry(scenario: Scenario, truth: Truth) -> None:
 
 
 def _put_in_place(partial: Path, destination: Path) -> None:
-    """Rename; what was there before is moved aside first and removed last, so that one of the two always exists."""
+    """Rename into place; the old folder is moved aside first and removed last, so that one of the two always exists."""
     if not destination.exists():
         partial.rename(destination)
         return
@@ -112,7 +112,7 @@ def _put_in_place(partial: Path, destination: Path) -> None:
 
 
 def _remove_leftovers(destination: Path) -> None:
-    """Remove what killed processes left beside the destination; an old flight without a successor is put back."""
+    """Remove leftovers of killed processes beside the destination; restore an old flight that has no successor."""
     for left in abandoned(destination.parent, destination.name, OLD):
         if destination.exists():
             shutil.rmtree(left, ignore_errors=True)
@@ -123,7 +123,7 @@ def _remove_leftovers(destination: Path) -> None:
 
 
 def check_destination(destination: Path, replace: bool) -> None:
-    """Refuse to overwrite what is not a synthetic flight folder."""
+    """Refuse to overwrite anything but a synthetic flight folder."""
     if not destination.exists():
         return
     ours = (destination / "truth" / "run.json").is_file() and (destination / "flight.toml").is_file()
@@ -254,7 +254,7 @@ def _text(value: str) -> str:
 
 
 def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
-    """Return ``flight.toml`` with the errors of the data sheets, without anything that was drawn."""
+    """Return ``flight.toml`` with the errors of the data sheets and no drawn values."""
     spec = scenario.spec
     acc = spec.accelerometer
     lines = [
@@ -305,7 +305,7 @@ def _flight_toml(scenario: Scenario, q_prior: FloatArray, vehicle: str) -> str:
 
 
 def _accelerometer_columns(mount: str) -> list[str]:
-    """Lines that declare the accelerometer's columns where they do not bear the names that are read without."""
+    """Lines that declare the accelerometer's columns if their names are not the default ones."""
     names = [(f"a{axis}", f"a{axis}_{mount}_mps2") for axis in "xyz"]
     if [name for _, name in names] == [quantity.canonical for quantity in tables.ACCELEROMETER]:
         return []
@@ -328,7 +328,7 @@ def _video_lines(table: str, listed: str, name: str, video: Video) -> list[str]:
 def _table(
     name: str, file: str, about: list[str], errors: InstrumentTable, spec: Section, more: Sequence[str] = ()
 ) -> list[str]:
-    """Table of an instrument: its file, what is ``about`` it, the errors that it always states and those it has."""
+    """Lines of an instrument's table: file, ``about``, the errors that are always stated, and nonzero optional ones."""
     stated, there = stated_errors(errors, spec), stated_errors(errors, spec, if_there=True)
     return ["", f"[{name}]", f'file = "telemetry/{file}.csv"', *about, *stated, *more, *there]
 
@@ -363,7 +363,7 @@ class Event:
 
 
 def heat_flux(density_kgpm3: FloatArray, airspeed_mps: FloatArray, nose_radius_m: float) -> FloatArray:
-    """Stagnation-point convective heat flux of a cold wall, W/m^2 (Sutton and Graves)."""
+    """Stagnation-point convective heat flux to a cold wall, W/m^2 (Sutton and Graves)."""
     return SUTTON_GRAVES * np.sqrt(density_kgpm3 / nose_radius_m) * airspeed_mps**3
 
 

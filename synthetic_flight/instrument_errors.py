@@ -61,7 +61,7 @@ CHILD = 0  # stands between an instrument's key and its child's: no name holds a
 
 @dataclass(frozen=True)
 class DropoutErrors:
-    """Bursts of lost samples: how many a second, how long on average, and stated intervals, s."""
+    """Dropouts: bursts per second and their mean length, s, and stated intervals, s."""
 
     rate_hz: float = 0.0
     mean_s: float = 0.0
@@ -117,7 +117,7 @@ def name_key(name: str) -> list[int]:
 
 
 def child(rng: np.random.Generator, name: str) -> np.random.Generator:
-    """Return the generator of one error of an instrument, without drawing from the instrument's own."""
+    """Return the generator of one instrument error without advancing the instrument's own."""
     seed = rng.bit_generator.seed_seq
     assert isinstance(seed, np.random.SeedSequence)
     key = (*seed.spawn_key, CHILD, *name_key(name))
@@ -125,7 +125,7 @@ def child(rng: np.random.Generator, name: str) -> np.random.Generator:
 
 
 def low_pass(values: FloatArray, step_s: float, bandwidth_hz: float, order: int) -> FloatArray:
-    """Rows ``(n, m)`` at equal steps behind a low-pass that was at rest at the first row.
+    """Rows ``(n, m)`` at equal steps after a low-pass filter that starts at rest.
 
     Exact for values that run straight between the rows (first-order hold).
     """
@@ -136,7 +136,7 @@ def low_pass(values: FloatArray, step_s: float, bandwidth_hz: float, order: int)
 
 
 def filtered(values: FloatArray, step_s: float, numerator: list[float], denominator: list[float]) -> FloatArray:
-    """Rows ``(n, m)`` behind a transfer function of unit gain in s, at rest at the first row; first-order hold."""
+    """Rows ``(n, m)`` after a transfer function in s of unit gain, starting at rest; first-order hold."""
     from scipy import signal  # half a second to import
 
     top, bottom, _ = signal.cont2discrete((numerator, denominator), step_s, method="foh")
@@ -148,7 +148,7 @@ def filtered(values: FloatArray, step_s: float, numerator: list[float], denomina
 
 @kernel
 def unit_gauss_markov(keep, white, out):
-    """Gauss-Markov noise of unit variance into ``out`` (n, m); ``keep`` (n - 1,): correlation from row to row."""
+    """Write Gauss-Markov noise of unit variance into ``out`` (n, m); ``keep`` (n - 1,): correlation from row to row."""
     for i in range(out.shape[1]):
         out[0, i] = white[0, i]
         for k in range(1, out.shape[0]):
@@ -167,7 +167,7 @@ def gauss_markov(
 
 
 def kept(time_s: FloatArray, spec: DropoutErrors, rng: np.random.Generator) -> BoolArray:
-    """Which samples arrive: bursts begin at random (Poisson) and last exponentially distributed times."""
+    """Mask of received samples: dropouts begin at random (Poisson) and last exponentially distributed times."""
     keep = np.ones(len(time_s), dtype=bool)
     bursts = [*spec.outages_s]
     if spec.rate_hz > 0.0 and spec.mean_s > 0.0:
@@ -180,14 +180,14 @@ def kept(time_s: FloatArray, spec: DropoutErrors, rng: np.random.Generator) -> B
 
 
 def clock_late_s(errors: TriadErrors, rng: np.random.Generator) -> float:
-    """By how much a triad's clock is late in one flight, beyond its delay."""
+    """Lateness of a triad's clock in one flight, s, in addition to its delay."""
     return errors.time_bias_s * float(child(rng, "time bias").standard_normal()) if errors.time_bias_s > 0.0 else 0.0
 
 
 def sampled(
     at_s: FloatArray, time_s: FloatArray, ideal: FloatArray, errors: TriadErrors, late_s: float = 0.0
 ) -> FloatArray:
-    """Values ``(n, 3)`` of an ideal signal at sampling times, behind bandwidth, delay and a clock that is ``late_s``.
+    """Values ``(n, 3)`` of an ideal signal at sampling times, after bandwidth, delay and a clock that is ``late_s``.
 
     ``ideal`` (m, 3) stands on an even grid ``time_s`` (m,) that begins before the samples.
     """
@@ -199,7 +199,7 @@ def sampled(
 def measured(
     at_s: FloatArray, sensed: FloatArray, errors: TriadErrors, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Times and values ``(k, 3)`` that a triad delivers of the signal ``sensed`` (n, 3) in its nominal axes."""
+    """Times and values ``(k, 3)`` measured by a triad from the true signal ``sensed`` (n, 3) in its nominal axes."""
     turn = rotations.dcm_from_q(rotations.exp(errors.mount_rad * rng.standard_normal(3)))
     factor = 1.0 + errors.scale * rng.standard_normal(3)
     offset = errors.bias * rng.standard_normal(3)
@@ -220,14 +220,14 @@ def measured(
 
 
 def tilted_axes(tilt_rad: FloatArray) -> FloatArray:
-    """Sensing directions, row by row, of axes that are not square: x stays, y tilts to x, z to x and y, (3, 3)."""
+    """Sensing directions (3, 3), row by row, of non-orthogonal axes: x stays, y tilts to x, z to x and y."""
     yx, zx, zy = tilt_rad
     rows = np.array([[1.0, 0.0, 0.0], [yx, 1.0, 0.0], [zx, zy, 1.0]])
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
 def quantised(values: FloatArray, limit: tuple[float, float, float] | None, resolution: float) -> FloatArray:
-    """Values ``(n, 3)`` as an analogue-digital converter gives them: whole steps, and no more of them than it has."""
+    """Values ``(n, 3)`` from an analogue-digital converter: quantised and saturated."""
     if resolution <= 0.0:
         return np.clip(values, -np.array(limit), np.array(limit)) if limit else values
     counts = np.round(values / resolution)
@@ -256,7 +256,7 @@ class Dropouts(Section):
     outages_s: tuple[tuple[Time, Time], ...] = ()
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         for k, (start, stop) in enumerate(self.outages_s):
             if stop <= start:
                 yield f"outages_s.{k}", [start, stop], "the outage does not end after it starts"
@@ -266,12 +266,12 @@ class Dropouts(Section):
 
     @property
     def errors(self) -> DropoutErrors:
-        """As the instruments take them."""
+        """Dropouts in the form that the instruments take."""
         return DropoutErrors(self.rate_hz, self.mean_s, self.outages_s)
 
 
 class Triad(Section):
-    """What accelerometers, gyros and magnetometers have in common beside the errors of their table.
+    """Settings common to accelerometers, gyros and magnetometers beside the errors of their table.
 
     ``bandwidth_hz`` is the corner of a low-pass of ``filter_order`` (0 for none); beyond the low-pass's own lag a
     sample shows what was there ``delay_s`` earlier (negative where stamps were corrected for that lag), and by a
@@ -291,12 +291,12 @@ class Triad(Section):
 
     @property
     def sizes(self) -> dict[str, tuple[float, ...]]:
-        """What is drawn, SI, by the field of `flightmodel.instruments.TriadSpec`."""
+        """Sizes of the drawn errors, SI, by field of `flightmodel.instruments.TriadSpec`."""
         return self.table.from_scenario(self)
 
     @property
     def errors(self) -> TriadErrors:
-        """In SI."""
+        """Errors of the triad in SI units."""
         size, limit = self.sizes, getattr(self, self.full_scale_key)
         unit = next(row.to_si for row in self.table.rows if row.name == "noise_sd")
         return TriadErrors(
@@ -382,14 +382,14 @@ class AirRefraction(Section):
     residual: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         heights = [height for height, _ in self.profile or ()]
         if any(b <= a for a, b in pairwise(heights)):
             yield "", None, "heights of the refractivity profile must increase"
 
     @property
     def air(self) -> Refractivity:
-        """The profile."""
+        """Refractivity profile."""
         if self.profile is None:
             return Refractivity(self.surface, self.scale_height_m)
         table = np.array(self.profile)
@@ -424,7 +424,7 @@ class Radar(Section):
     dropouts: Dropouts | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         for key in ("range_rate_bias_mps", "range_rate_wander_mps"):
             if getattr(self, key, 0.0) > 0.0 and self.range_rate_sd_mps == 0.0:
                 words = "of a range rate that is not measured: state its noise, range_rate_sd_mps, too"
@@ -433,7 +433,7 @@ class Radar(Section):
 
     @property
     def refraction_left(self) -> float:
-        """Size of the part of refraction that the range's correction leaves."""
+        """Fraction of the refraction that the range's correction leaves uncorrected."""
         return 0.0 if self.refraction is None else abs(self.refraction.residual)
 
 
@@ -454,7 +454,7 @@ ShapeAngle = Annotated[float, Field(ge=-5.0, le=5.0)]
 
 
 class FilmQuality(Section):
-    """How the real camera differs from its drawing, and how it records; see `synthetic_flight.film.Imaging`."""
+    """Differences of the real camera from its drawing, and recording quality; see `synthetic_flight.film.Imaging`."""
 
     pointing_deg: ErrorAngle = 0.5
     focal: Fraction = 0.01
@@ -475,13 +475,13 @@ class FilmQuality(Section):
     loaded_shape_deg: tuple[ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         if self.interlace_s and self.readout_s:
             yield "readout_s", self.readout_s, "either fields (interlace_s) or rows in turn"
 
 
 class Video(Section):
-    """When the onboard camera records, and how well."""
+    """Recording times and quality of the onboard camera."""
 
     camera: str
     start_s: Time
@@ -494,7 +494,7 @@ class Video(Section):
     imaging: FilmQuality = FilmQuality()
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         if self.stop_s < self.start_s:
             yield "stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted"
         if not self.start_s <= self.benchmark_s <= self.stop_s:
@@ -503,7 +503,7 @@ class Video(Section):
 
 
 class Attitude(Section):
-    """The attitude that the range states to start from."""
+    """Initial attitude stated by the range."""
 
     t_s: Time
     sd_deg: Annotated[float, Field(gt=0.0, le=180.0)]
@@ -513,7 +513,7 @@ LAST_DIGIT = 1e-6  # of the telemetry's files: noise below it is not in them, an
 
 
 def stated_errors(table: InstrumentTable, section: Section, if_there: bool = False) -> list[str]:
-    """Lines of flight.toml that state an instrument's nominal errors, nothing that was drawn.
+    """Lines of flight.toml with an instrument's nominal errors, without drawn values.
 
     Parameters
     ----------
@@ -538,11 +538,11 @@ def stated_errors(table: InstrumentTable, section: Section, if_there: bool = Fal
 
 
 def _noise_sd(sd: float, resolution: float) -> float:
-    """Return the stated standard deviation: an ideal instrument has that of its steps or of the last digit."""
+    """Return the stated standard deviation; for an ideal instrument, that of its resolution or the last digit."""
     return sd if sd >= LAST_DIGIT else max(LAST_DIGIT, round(resolution / np.sqrt(12.0), 9))
 
 
 def _together(*sds: float) -> float:
-    """Return the one number that is stated of independent errors; of a single one, that number as it was written."""
+    """Return the root sum square stated for independent errors; a single one is returned as it was written."""
     present = [sd for sd in sds if sd > 0.0]
     return present[0] if len(present) == 1 else float(f"{np.linalg.norm(present):.4g}")

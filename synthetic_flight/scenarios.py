@@ -1,4 +1,4 @@
-"""What is to be flown? A scenario file with its vehicle, and the true flight of it with the atmosphere of one seed.
+"""What is flown? A scenario file with its vehicle, and its true flight with the atmosphere of one seed.
 
 A scenario gives start, end and steps, the initial state of the composite c.g. ``(r, v, q, omega)`` at zero deflection,
 the day-of-flight atmosphere and the instruments. Every random part draws from ``SeedSequence(seed, spawn_key=name)``
@@ -54,7 +54,7 @@ MOST_RECORDS, MOST_STEPS, MOST_SAMPLES, MOST_FRAMES = 5_000_000, 2_000_000_000, 
 
 
 class TimeSpan(Section):
-    """When the flight starts and stops, and how finely it is integrated and recorded, s."""
+    """Start and stop times of the flight, and its integration and recording steps, s."""
 
     start_s: Time
     stop_s: Time
@@ -64,7 +64,7 @@ class TimeSpan(Section):
     record_s: Duration = 0.004
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         span, record, step = self.stop_s - self.start_s, self.record_s, self.step_s
         if not self.start_s <= self.telemetry_from_s < self.stop_s:
             words = f"start_s = {self.start_s:g} <= telemetry_from_s < stop_s = {self.stop_s:g} is wanted"
@@ -106,7 +106,7 @@ class Initial(Section):
 
 
 class EventOfFlight(Section):
-    """A named event, which mass steps of the vehicle may refer to; flight.toml gets it."""
+    """Named event, written to flight.toml; mass steps of the vehicle may refer to it."""
 
     name: Label
     t_s: Time
@@ -116,7 +116,7 @@ INFLATED = "aeroshell inflated"  # event of `TimeSpan.inflated_s`
 
 
 class ScenarioFile(Section):
-    """The whole of a scenario file."""
+    """Complete content of a scenario file."""
 
     name: str
     t0_utc: str
@@ -157,7 +157,7 @@ class ScenarioFile(Section):
         return alone | {f"videos.{name}": video for name, video in self.videos.items()}
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         start, stop = self.time.telemetry_from_s, self.time.stop_s
         words = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted"
         if not self.radars and not self.gnss:
@@ -207,7 +207,7 @@ class Scenario:
 
     @property
     def mean_air(self) -> MeanAir:
-        """Air of the place and day where the flight starts, before any random structure."""
+        """Mean atmosphere of the flight's place and day, before any random structure."""
         north, east = np.deg2rad([self.spec.initial.latitude_deg, self.spec.initial.longitude_deg])
         return mean_air(self.spec.atmosphere, self.source.parent, self.spec.t0_utc, float(north), float(east))
 

@@ -66,7 +66,7 @@ def sample_times(start_s: float, stop_s: float, rate_hz: float, offset_s: float 
 def sense_accelerometer(
     truth: Truth, vehicle: Vehicle, mount: str, spec: Accelerometer, start_s: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) and specific force ``(n, 3)`` in the package's own axes, m/s^2, at its own place.
+    """Times (n,) and specific force ``(n, 3)``, m/s^2, at the package's location and in its own axes.
 
     Where the three elements have places of their own, each feels the specific force there.
     """
@@ -121,7 +121,7 @@ def sense_magnetometer(
 
 
 def sense_attitude(truth: Truth, spec: Attitude, rng: np.random.Generator) -> FloatArray:
-    """Quaternion (4,) ECEF from body that another source states for one time."""
+    """Quaternion (4,) ECEF from body at one time, as stated by an external source."""
     q = rotations.slerp(truth.time_s, truth.trajectory.q_ecef_body, np.array([spec.t_s]))[0]
     return rotations.boxplus(q, np.deg2rad(spec.sd_deg) * rng.standard_normal(3))
 
@@ -327,7 +327,7 @@ def echo(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
 def range_rates(
     truth: Truth, spec: Radar, time_s: FloatArray, seen_at_s: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Doppler (n,): rate of the echo's range m/s when it was seen, with the errors of its own of those tags."""
+    """Doppler (n,): range rate of the echo, m/s, at the times the radar saw it, with Doppler errors."""
     step_s = 1e-3  # a jerk of 1000 m/s3 makes 0.2 mm/s
     before, after = (np.clip(seen_at_s + s, truth.time_s[0], truth.time_s[-1]) for s in (-step_s, step_s))
     rate = (echo(truth, spec, after)[:, 0] - echo(truth, spec, before)[:, 0]) / (after - before)
@@ -340,7 +340,7 @@ def range_rates(
 
 
 def in_air(geometric: FloatArray, spec: Radar) -> FloatArray:
-    """Range, azimuth, elevation ``(n, 3)`` with that part of refraction which the range's correction leaves in.
+    """Range, azimuth, elevation ``(n, 3)`` with the refraction that the range's correction leaves.
 
     Below 0.5 deg of elevation, where layers along the horizon rule, refraction stays what it is there.
     """
@@ -367,13 +367,13 @@ def servo_lag(truth: Truth, spec: Radar, time_s: FloatArray) -> FloatArray:
 
 
 def drawn(rng: np.random.Generator, name: str, size: float, count: int) -> FloatArray:
-    """Constant errors (count,) of one size, from the generator's child of a name."""
+    """Constant errors (count,) of one standard deviation, from the named child of the generator."""
     # np.zeros keeps an absent error from costing a generator
     return size * child(rng, name).standard_normal(count) if size > 0.0 else np.zeros(count)
 
 
 def pedestal_errors(observed: FloatArray, spec: Radar, rng: np.random.Generator) -> FloatArray:
-    """Systematic errors ``(n, 3)`` of range, azimuth and elevation that the pedestal adds to what arrives at it."""
+    """Systematic errors ``(n, 3)`` that the pedestal adds to range, azimuth and elevation."""
     slant, az, el = observed.T
     out = np.zeros_like(observed)
     size = RADAR.from_scenario(spec)
@@ -408,7 +408,7 @@ def mislevel(azimuth_rad: FloatArray, elevation_rad: FloatArray, tilt_rad: Float
 
 
 def wander(time_s: FloatArray, observed: FloatArray, spec: Radar, rng: np.random.Generator) -> FloatArray:
-    """Slow random errors ``(n, 3)``: of the range, and of both angles, of one size normal to the line of sight."""
+    """Gauss-Markov errors ``(n, 3)`` of range and angles; both angles have one sd normal to the line of sight."""
     out = np.zeros_like(observed)
     size = RADAR.from_scenario(spec)
     (sd,), (tau_s,) = size["range_wander_sd_m"], size["range_wander_time_constant_s"]

@@ -127,7 +127,7 @@ class Truth(Tabular):
         )
 
     def _by_phase(self, of: Callable[[FloatArray, Vehicle], FloatArray]) -> FloatArray:
-        """Return a function of states and vehicle at every record, with the mass properties of its time."""
+        """Evaluate a function of states and vehicle at every record, with the mass properties of its time."""
         rows = _phase_rows(self.vehicle, self.time_s)
         return np.concatenate([of(self.state_eci[part], vehicle) for part, vehicle in rows])
 
@@ -157,7 +157,7 @@ class Truth(Tabular):
 
 
 def _phase_rows(vehicle: Vehicle, time_s: FloatArray) -> list[tuple[slice, Vehicle]]:
-    """Records of each span in which mass properties hold; a record at its beginning has the new ones."""
+    """Records of each span with constant mass properties; a record at a change has the new ones."""
     phases = vehicle.phases(float(time_s[0]), np.inf)
     edges = np.searchsorted(time_s, [begins - 1e-9 for begins, _, _ in phases]).tolist()
     ends = [*edges[1:], len(time_s)]
@@ -166,7 +166,7 @@ def _phase_rows(vehicle: Vehicle, time_s: FloatArray) -> list[tuple[slice, Vehic
 
 @dataclass(frozen=True)
 class Schedule:
-    """Steps and records that flights side by side share: ``records`` of them, ``per_record`` steps apart."""
+    """Steps and records shared by flights integrated together: ``records`` of them, ``per_record`` steps apart."""
 
     step_s: float
     per_record: int
@@ -394,7 +394,7 @@ def _fly_phases(
 
 
 def _handed_over(state: FloatArray, before: Vehicle, after: Vehicle) -> FloatArray:
-    """State (20,) of the same motion of the hardware with other mass properties."""
+    """State (20,) of the same motion after a change of mass properties."""
     if after is before:
         return state
     (old, old_v), (new, new_v) = (dynamics.offsets(state, vehicle)["joint"] for vehicle in (before, after))
@@ -526,7 +526,7 @@ def atmosphere_table(profile: AtmosphereProfile) -> FloatArray:
 
 
 def vacuum_table() -> FloatArray:
-    """Table of no atmosphere, for flights under gravity and springs alone."""
+    """Kernel table of a vacuum, for flights under gravity and springs alone."""
     return np.tile(np.array([0.0, 0.0, 300.0, 0.0, 0.0, 0.0]), (ATMOSPHERE_ROWS, 1))
 
 
@@ -570,14 +570,14 @@ def workspace(states: FloatArray, parameters: FloatArray, step_s: float = 0.0) -
 
 
 def with_creep(state: FloatArray, vehicle: Vehicle) -> FloatArray:
-    """State (20,), or (22,) without creep yet where the vehicle's joint creeps and the state does not say how far."""
+    """State (20,), or (22,) with zero creep added if the joint creeps and the state has none."""
     if vehicle.joint.creep_share == 0.0 or len(state) != STATES:
         return state
     return np.append(state, np.zeros(CREEP_STATES))
 
 
 def _finite_records(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Records up to the first that is not finite."""
+    """Number of records before the first one that is not finite."""
     finite = np.isfinite(states).all(axis=-1)
     n = len(states) if finite.all() else int(np.argmin(finite))
     return states[:n], aux[:n]

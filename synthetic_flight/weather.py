@@ -65,7 +65,7 @@ class Pocket(Section):
 
 
 class Shear(Section):
-    """A change of wind through a layer; above it the wind is changed by the whole of it."""
+    """Change of wind through a layer; above the layer the full change applies."""
 
     altitude_m: Altitude
     north_mps: Wind
@@ -82,7 +82,7 @@ class Turbulence(Section):
     to_m: Altitude
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         if self.to_m - self.from_m < 2.0 * self.length_m:
             yield "", None, "a band from_m to to_m of at least two length_m is wanted"
 
@@ -137,7 +137,7 @@ class DayOfFlightAtmosphere(Section):
         return value
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield a fault for each key that contradicts another."""
         if self.from_ is not None and "base" in self.model_fields_set:
             yield "from", self.from_, f"base = '{self.base}' states another air; keep one of the two"
         if self.mean_wind is not None and not self.winds:
@@ -169,7 +169,7 @@ _AUGUST_MONTHS, _AUGUST_LATITUDES_DEG = (7, 8), (30.0, 45.0)
 
 @dataclass(frozen=True)
 class MeanAir:
-    """Air of the place and the day before any random structure.
+    """Mean atmosphere of the place and day, before any random structure.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ _NO_WIND = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
 def mean_air(
     spec: DayOfFlightAtmosphere, folder: Path, t0_utc: str, latitude_rad: float, longitude_rad: float
 ) -> MeanAir:
-    """Air that a scenario of a folder, place and time states, or that of its place and month.
+    """Mean atmosphere as stated by a scenario, or else that of its place and month.
 
     Raises
     ------
@@ -333,7 +333,7 @@ def _resampled(profile: AtmosphereProfile, z: FloatArray) -> AtmosphereProfile:
 
 
 def _on_base(day: AtmosphereProfile, base: AtmosphereProfile) -> AtmosphereProfile:
-    """Add the day's structure to a modelled base; above 130 km it fades over 10 km to the base alone."""
+    """Add the day's structure to a modelled base; above 130 km the structure decays over 10 km."""
     z = np.union1d(base.altitude_m, np.union1d(day.altitude_m, np.arange(TOP_M, TOP_M + 60e3, 1000.0)))
     under = _resampled(base, z)
     fade = np.exp(-np.maximum(z - TOP_M, 0.0) / day.fade_m)

@@ -1,1 +1,1 @@
-"""A bench to work at a film by hand: `postflight camera FOLDER`."""
+"""Camera bench for reviewing a film by hand: `postflight camera FOLDER`."""

@@ -1,4 +1,4 @@
-"""The bench's page for a browser on this machine, and nobody else.
+"""Web page of the camera bench, served to this machine only.
 
 The server listens on 127.0.0.1 alone. Every address begins with a random token that only the printed address holds;
 the Host header must name this machine (another site's name that resolves to it is refused), a request that changes
@@ -47,10 +47,10 @@ class _LocalRequest(Request):
 
 
 class _SilentHandler(WSGIRequestHandler):
-    """Writes no line a request: they would hold the token."""
+    """Request handler that logs nothing, since log lines would contain the token."""
 
     def log(self, type: str, message: str, *args: Any) -> None:
-        """Say nothing."""
+        """Log nothing."""
 
 
 class Bench:
@@ -110,7 +110,7 @@ class Bench:
         return _json(self.session.frame(int(number), tried[0], tried[1], _pose(request)))
 
     def _save(self, request: _LocalRequest, port: str) -> Response:
-        """Take the page's decisions; from any other origin, or as anything but JSON, they are refused."""
+        """Save the page's decisions; requests from another origin, or not in JSON, are refused."""
         own = {f"http://{name}:{port}" for name in (HOST, "localhost")}
         if request.headers.get("Origin", "") not in own or request.mimetype != "application/json":
             raise BadRequest
@@ -154,7 +154,7 @@ def _pose(request: Request) -> FloatArray | None:
 
 
 def serve(session: Session, port: int = 0) -> tuple[BaseWSGIServer, str]:
-    """Server of a session, which `BaseWSGIServer.serve_forever` starts, and the page's address.
+    """Create a session's server, to be started by `BaseWSGIServer.serve_forever`, and the page's address.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def open_bench(folder: Path, camera: str | None, port: int, browser: bool) -> No
 
 
 def session_of(flight: Flight, folder: Path, camera: str | None = None) -> Session:
-    """Session for a camera's film, of several the first without a name; `GateError` where there is none such."""
+    """Session of a camera's film, the first one without a name; `GateError` if there is no such film."""
     films = flight.telemetry.films
     if not films:
         raise GateError(f"{folder}: the flight has no video; [frames] in flight.toml names it", code="video-missing")

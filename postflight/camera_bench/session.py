@@ -37,7 +37,7 @@ _CHANGED = "was changed by another program since this page was loaded; load the 
 
 @dataclass(frozen=True)
 class _Work:
-    """Decisions, the camera oriented with them (None: why not), and the fits so far, by frame."""
+    """State of a session: decisions, the camera oriented with them (None with the reason), and fits so far by frame."""
 
     frames: Frames
     oriented: OrientedCamera | None
@@ -70,7 +70,7 @@ class Session:
         self._fitter.start()
 
     def close(self) -> None:
-        """End the fitting."""
+        """Stop fitting."""
         self._ended = True
         self._wake.set()
         self._fitter.join()
@@ -107,7 +107,7 @@ class Session:
         }
 
     def _answers(self, work: _Work) -> list[dict[str, Any] | None]:
-        """Answer of each frame as a run would give it from the fits so far; None where it is not fitted yet."""
+        """Answer of each frame from the fits so far, as a run would give it; None if the frame is not fitted yet."""
         done = sorted(work.fits)
         textured = work.oriented is not None and has_texture(work.oriented)
         fits = judged(
@@ -140,7 +140,7 @@ class Session:
         return last[1]
 
     def frame(self, index: int, theta_rad: float | None, plane_rad: float | None, pose: FloatArray | None) -> dict:
-        """Outline and points of a frame, at its own answer, or at a deflection or from a pose that is being tried.
+        """Outline and points of a frame, at its own answer or at a trial deflection or pose.
 
         Returns
         -------
@@ -176,7 +176,7 @@ class Session:
     # --------------------------------------------------------------------------------------------- what is decided
 
     def save(self, rows: Sequence[dict[str, Any]], revision: str) -> dict[str, Any]:
-        """Write all decisions about this camera, and fit anew what they touch.
+        """Save all decisions about this camera and refit the affected frames.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class Session:
         return [row for row in read_edits(self.path, None).rows if row.camera != self._work.frames.camera_name]
 
     def _apply(self, edits: CameraEdits) -> None:
-        """Take decisions over; the frames that they touch lose their fits, all of them where the camera does."""
+        """Apply decisions; the affected frames lose their fits, and all frames do if the camera is affected."""
         before = self._work
         at_s = self._flight_benchmark_s if edits.benchmark_s is None else edits.benchmark_s
         frames = replace(before.frames, edits=edits, benchmark_s=at_s)
@@ -235,7 +235,7 @@ class Session:
         return _Work(frames, oriented, NO_FAULT, {})
 
     def _fit_all(self) -> None:
-        """Fit what has no fit yet, frame by frame from the first on, and wait for the next decision."""
+        """Fit all frames without a fit, from the first on, then wait for the next decision."""
         while not self._ended:
             self._wake.clear()
             work = self._work
@@ -253,14 +253,14 @@ class Session:
 
 
 def _about(edits: CameraEdits, t_s: float) -> list[Edit]:
-    """Decisions that change a fit of the frame at a time; of no frame (NaN): poses and masks of all frames."""
+    """Decisions that affect the fit of the frame at a time; without a frame (NaN), poses and masks of all frames."""
     return [row for row in edits.rows if row.edit in ("mask", "rim", "feature", "pose") and row.is_of(t_s)]
 
 
 def _points(
     view: VirtualCamera, oriented: OrientedCamera | None, picture: EditedFrame, own: FloatArray, tried: FloatArray
 ) -> tuple[list[list[float]], list[list[float]]]:
-    """Edge points and features found near a frame's own deformation, against one that is tried."""
+    """Edge points and features near a frame's own deformation, compared with a trial deformation."""
     if oriented is None:
         lines = view.lines_at(view.edge_clocks(), tried)
         found = picture.near_edge(lines)
@@ -306,7 +306,7 @@ def _edit_json(row: Edit) -> dict[str, Any]:
 
 
 def _edit_of(row: dict[str, Any], camera: str) -> Edit:
-    """Edit from the page; `GateError` where it is none."""
+    """Edit from the page; `GateError` if it is invalid."""
     try:
         numbers = {k: float("nan") if row.get(k) is None else float(row[k]) for k in ("t_s", "u_px", "v_px", "value")}
         words: dict[str, str] = {k: row.get(k, "") for k in ("edit", "name", "note")}

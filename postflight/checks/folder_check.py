@@ -1,4 +1,4 @@
-"""What should an analyst know of a flight folder before running it? Facts, findings, cross-checks and what is refused.
+"""What should an analyst know of a flight folder before running it? Facts, findings, cross-checks and refusals.
 
 Facts: rows, span, rate of every table. Findings: what the readers saw (gaps, frozen, saturated, repeated, unordered
 rows). Cross-checks: sensors against each other and against physics, in units, axes, time tags; a remark is made only
@@ -48,7 +48,7 @@ console = terminal(width=None if sys.stdout.isatty() else WIDE)
 
 @dataclass(frozen=True)
 class Fact:
-    """One table: rows, first and last time, samples a second (the usual one), rows with a missing value."""
+    """Summary of one table: rows, first and last time, typical samples per second, rows with a missing value."""
 
     source: str
     file: str
@@ -61,7 +61,7 @@ class Fact:
 
 @dataclass(repr=False)
 class Report(Tabular):
-    """Everything that a check found; ``exit_code`` as the command leaves with.
+    """Result of a check; ``exit_code`` is the command's.
 
     ``inputs`` are those of the flight, ``alone`` what commands without flight.toml have data for.
     """
@@ -86,7 +86,7 @@ class Report(Tabular):
         return pd.DataFrame(rows, columns=["kind", "code", "source", "message", "start_s", "end_s"])
 
     def _about(self) -> str:
-        """How many of each kind."""
+        """Number of findings of each kind, in words."""
         counts = (
             (len(self.findings), "findings", "finding"),
             (len(self.cross_checks), "suspicious cross-checks", "suspicious cross-check"),
@@ -98,7 +98,7 @@ class Report(Tabular):
 
     @property
     def can_run(self) -> str:
-        """Methods that can run, and what the others lack."""
+        """Methods that can run, and the missing inputs of the others."""
         words = ["nothing before the refused inputs are corrected"] if self.refused else []
         words += ["nothing before the placeholders are filled in"] if self.fill_in and not self.refused else []
         if self.inputs is not None and not words:
@@ -106,7 +106,7 @@ class Report(Tabular):
         return "; ".join([*words, *(f"{inputs.names} ({command})" for command, inputs in self.alone.items())])
 
     def as_json(self) -> dict[str, Any]:
-        """Return everything as JSON; times that are none become null."""
+        """Return everything as JSON; missing times become null."""
         biases = self.time_biases
         return {
             "can_run": self.can_run,
@@ -176,7 +176,7 @@ def _runs_alone(report: Report, folder: Path, vehicle: Path | None) -> bool:
 
 
 def _named(folder: Path) -> set[str] | None:
-    """Every text of flight.toml; None where it cannot be read."""
+    """All strings of flight.toml; None if it cannot be read."""
     try:
         return set(_texts(read_toml(folder / "flight.toml")))
     except GateError:
@@ -184,7 +184,7 @@ def _named(folder: Path) -> set[str] | None:
 
 
 def _not_used(folder: Path) -> list[Issue]:
-    """Tables below ``telemetry/`` that flight.toml does not name: delivered, imported perhaps, and read by nobody."""
+    """Tables below ``telemetry/`` that flight.toml does not name, so that no command reads them."""
     named = _named(folder)
     if named is None:
         return []
@@ -203,7 +203,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _vehicle_faults(folder: Path) -> list[Issue]:
-    """Faults of the vehicle file, which is not reached where flight.toml has some."""
+    """Faults of the vehicle file, which are not reached if flight.toml has faults of its own."""
     try:
         named = read_toml(folder / "flight.toml").get("vehicle")
     except GateError:
@@ -225,7 +225,7 @@ def _refuse(report: Report, folder: Path, faults: Sequence[Issue], code: int) ->
 
 
 def _loads(report: Report, found: Sources) -> list[Fact]:
-    """Fact of the table of loads, whose faults are refusals."""
+    """Summary of the table of loads; its faults are added to the refusals."""
     if found.loads is None or found.vehicle is None:
         return []
     from postflight.loads_table import read_table_of_loads
@@ -272,7 +272,7 @@ def _facts(found: Sources) -> list[Fact]:
 
 
 def _cross_check(found: Sources, report: Report) -> None:
-    """Sensors against each other and against physics."""
+    """Compare sensors with each other and with physics."""
     # an entry's one channel has neither a size nor axes to compare
     whole = {name: t for name, t in found.triads.items() if np.isfinite(t.measured_sensor).any(axis=0).all()}
     found, remarks = replace(found, triads=whole), report.cross_checks
@@ -317,12 +317,12 @@ def _cross_check(found: Sources, report: Report) -> None:
 
 
 def _doubts_accelerometer(remark: Issue) -> bool:
-    """Whether a remark says that the accelerometer's unit, scale or axes are wrong."""
+    """Whether a remark questions the accelerometer's unit, scale or axes."""
     return remark.source == "accelerometer" and remark.code in ("unit-suspect", "accelerometer-scale", "axes-suspect")
 
 
 def _against_accelerometer(found: Sources, name: str, record: RadarRecord | GnssRecord, report: Report) -> None:
-    """Scale and time tags of the accelerometer against one track's specific force."""
+    """Compare scale and time tags of the accelerometer with one track's specific force."""
     sensed, remarks = found.triads.get("accelerometer"), report.cross_checks
     if sensed is None:
         return
@@ -338,7 +338,7 @@ def _against_accelerometer(found: Sources, name: str, record: RadarRecord | Gnss
 
 
 def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report: Report) -> None:
-    """Axes and attitude of the inertial sensors against one track's specific force."""
+    """Compare axes and attitude of the inertial sensors with one track's specific force."""
     remarks = report.cross_checks
     force = track_force(record.time_s, tracks.position_of(record, found.spec.body), _FORCE_WIDTH_S, found.spec.body)
     if force is None or "accelerometer" not in found.triads:
@@ -352,7 +352,7 @@ def _axes_and_attitude(found: Sources, record: RadarRecord | GnssRecord, report:
 
 
 def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
-    """Add a time bias to the report where its standard deviation is small enough; None where it is not."""
+    """Add a time bias to the report if its standard deviation is small enough, else return None."""
     if bias is None or not bias.is_sharp:
         return None
     report.time_biases.append(bias)
@@ -360,7 +360,7 @@ def _keep_sharp(report: Report, bias: TimeBias | None) -> TimeBias | None:
 
 
 def _against_place(found: Sources, trackers: dict[str, RadarRecord | GnssRecord], report: Report) -> None:
-    """Barometers and the magnetometer's magnitude against the first track, a receiver's where there is one."""
+    """Compare barometers and the magnetometer's magnitude with the first track, preferably a receiver's."""
     record = trackers[next((name for name in trackers if name in found.gnss), next(iter(trackers)))]
     position = tracks.position_of(record, found.spec.body)
     whole = np.isfinite(position).all(axis=1)
@@ -454,7 +454,7 @@ def _tried(source: str, frames: Frames, vehicle: Vehicle | None) -> list[Issue]:
 
 
 def text_in_films(found: Sources) -> list[Issue]:
-    """Find text burnt into films, which is left out of what the camera reads."""
+    """Find text burnt into films; it is masked in the camera's measurements."""
     out = []
     for name, frames in found.films.items():
         hidden = frames.burnt_in
@@ -466,7 +466,7 @@ def text_in_films(found: Sources) -> list[Issue]:
 
 
 def frozen_films(found: Sources) -> list[Issue]:
-    """Find pictures that a film repeats to the last bit, which noise forbids: ``frame-frozen`` for each stretch."""
+    """Find bit-identical repeated pictures, which noise rules out: ``frame-frozen`` for each stretch."""
     return [one for name, film in found.films.items() for one in _repeats(name, film)]
 
 

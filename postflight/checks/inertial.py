@@ -71,7 +71,7 @@ _SLIPS = {
 
 
 def sparse(found: Sources) -> list[Issue]:
-    """Name sensors whose samples are too far apart for the forces of a flight (``too-few-data``)."""
+    """Name sensors sampled too sparsely for the forces of a flight (``too-few-data``)."""
     if found.spec.motion.model == "ballistic":
         return []
     out = []
@@ -220,7 +220,7 @@ def _sum_of_readings(record: TriadRecord, force: TrackForce, use: BoolArray) -> 
 
 
 def gyro_axes(found: Sources, force: TrackForce) -> list[Issue]:
-    """Check scale, order and signs of the gyros by the force that they carry.
+    """Check scale, order and signs of the gyros by the specific force rotated with their rates.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ def gyro_axes(found: Sources, force: TrackForce) -> list[Issue]:
 
 
 def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) -> tuple[str, str]:
-    """Code and hint of what would mend the rates: all good readings differ by unit alone, by axes alone, or by both."""
+    """Code and hint for the rates: all good candidates differ by unit alone, by axes alone, or by both."""
     scale, axes = best
     if all(r[1] == AS_DECLARED for r in near):
         return "unit-suspect", unit_hint(declared, unit_that_explains(scale, declared))
@@ -275,7 +275,7 @@ def _which(near: list[_Reading], best: _Reading, off_rad: float, declared: str) 
 
 
 def attitude_prior(found: Sources, force: TrackForce) -> list[Issue]:
-    """Check the attitude prior by the force that the gyros carry from it: ``attitude-prior`` or none."""
+    """Check the attitude prior by the specific force rotated with the gyros from it: ``attitude-prior`` or none."""
     prior, gyros, sensed = found.attitude_prior, found.triads.get("rates"), found.triads.get("accelerometer")
     if prior is None or gyros is None or sensed is None:
         return []
@@ -321,14 +321,14 @@ def _as_stated_and_slipped(prior: AttitudePrior, planet: earth.Planet) -> FloatA
 
 
 def _carried_sd_rad(prior: AttitudePrior, gyros: TriadRecord, grid: FloatArray, w: FloatArray) -> float:
-    """Standard deviation of a right attitude at the end: the prior's, with the gyros' bias and scale."""
+    """Standard deviation of a correct attitude at the end: the prior's, with the gyros' bias and scale."""
     turned = float(np.linalg.norm(w, axis=1).sum()) * _CELL_S
     s = gyros.spec
     return float(np.linalg.norm([prior.sd_rad.max(), s.bias_sd * (grid[-1] - grid[0]), s.scale_sd * turned]))
 
 
 def _cells(record: TriadRecord, grid: FloatArray) -> FloatArray:
-    """Means (m, 3), body axes, over cells from each time of the grid on; NaN in gaps and beyond the ends."""
+    """Means (m, 3), body axes, over cells starting at each time of the grid; NaN in gaps and beyond the ends."""
     body = record.measured_sensor @ record.spec.dcm_body_sensor.T
     whole = np.isfinite(body).all(axis=1)
     t, v = record.time_s[whole], body[whole]
@@ -341,7 +341,7 @@ def _cells(record: TriadRecord, grid: FloatArray) -> FloatArray:
 def _carried(
     q: FloatArray, turn: FloatArray, grid: FloatArray, w: FloatArray, a: FloatArray, force: TrackForce, clear: _Rows
 ) -> FloatArray:
-    """Forces (c, k, 3) of k windows, carried from attitudes (c, 4) by rates that matrices (c, 3, 3) make of ``w``."""
+    """Forces (c, k, 3) of k windows, carried from attitudes (c, 4) by rates: (c, 3, 3) matrices times ``w``."""
     sums = np.zeros((len(q), len(clear), 3))
     half = 0.5 * force.width_s
     for k, t in enumerate(grid):
@@ -354,7 +354,7 @@ def _carried(
 
 
 def _wander(sums: FloatArray, track_mps2: FloatArray) -> FloatArray:
-    """Rms angle (c,) between carried forces (c, k, 3) and the track's (k, 3) after the best rotation of each, rad."""
+    """Rms angle (c,), rad, between carried forces (c, k, 3) and the track's (k, 3), after the best rotation of each."""
     track = track_mps2 / np.linalg.norm(track_mps2, axis=1)[:, None]
     out = np.empty(len(sums))
     for c, vectors in enumerate(sums):

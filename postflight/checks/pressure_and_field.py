@@ -164,7 +164,7 @@ def _on(record: TriadRecord, grid: FloatArray) -> FloatArray:
 
 
 def _explained(w: FloatArray, b: FloatArray, change: FloatArray) -> tuple[float, float]:
-    """Share of the rotation's square that is explained, and the scale of ``w``."""
+    """Fraction of the squared rotation that ``w`` explains, and the scale of ``w``."""
     # db/dt = k b x w + w x (k b0): linear in k and k b0
     design = np.stack([np.cross(b, w).ravel(), *(np.cross(w, axis).ravel() for axis in np.eye(3))])
     design = design / (norm := np.sqrt(np.maximum(np.einsum("ik,ik->i", design, design), 1e-300)))[:, None]
@@ -179,7 +179,7 @@ def _explained(w: FloatArray, b: FloatArray, change: FloatArray) -> tuple[float,
 
 
 def _lag(gyros: TriadRecord, field: TriadRecord) -> tuple[float, float] | None:
-    """How late the magnetometer is against the gyros, s, with its sd: the top of a parabola about the best of a row."""
+    """Delay of the magnetometer against the gyros, s, with its sd: maximum of a parabola through the best lags."""
     grid = _grid(gyros, field, 0.0)  # as fine as can be: lags show in what happens fast
     if grid is None:
         return None

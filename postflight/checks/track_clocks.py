@@ -1,4 +1,4 @@
-"""Do trackers and inertial sensors count the same time? For a flight whose trajectory contradicts itself.
+"""Do trackers and inertial sensors share one time base? For a flight whose trajectory contradicts itself.
 
 A wrong time tag of seconds is no small error of the filter: it bends the path until scales and mountings are blamed.
 The specific force of each track against the accelerometer's needs no filter (`postflight.checks.track_force`), and the
@@ -18,7 +18,7 @@ from recon.fault_isolation import TRIADS
 
 
 def clock_faults(telemetry: Telemetry, without: tuple[str, ...] = ()) -> tuple[Issue, ...]:
-    """Clocks that are off by more than 5 sd and 0.1 s, with the sensors between which they are.
+    """Clocks that are off by more than 5 sd and 0.1 s, with the pairs of sensors that show it.
 
     Parameters
     ----------

@@ -224,7 +224,7 @@ def _compare(force: TrackForce, time_s: FloatArray, sensed_mps2: FloatArray) -> 
 
 
 def bias_of(name: str, seen: Comparison | None) -> TimeBias | None:
-    """Time bias of a track against the accelerometer; None where the comparison describes none, or badly."""
+    """Time bias of a track against the accelerometer; None if the comparison does not determine it."""
     if seen is None or not seen.misfit < _FITS:
         return None
     return TimeBias(name, "accelerometer", seen.lag_s, seen.lag_sd_s)

@@ -1,4 +1,4 @@
-"""Do tracks fall as gravitation asks, agree with each other in place and time, and lie in one span of time?
+"""Do tracks fall as gravity requires, agree with each other in place and time, and cover the same span of time?
 
 Above the atmosphere the specific force of a track is zero. A range in feet that is read as metres falls three times too
 slowly or too fast; so every unit that a radar's columns may have is tried, and one is named only where the declared one
@@ -62,7 +62,7 @@ def position_of(record: RadarRecord | GnssRecord, planet: earth.Planet = earth.W
 
 
 def outside_time(found: Sources) -> list[Issue]:
-    """Check that tables and the attitude prior lie in the time of the others: ``time-not-covered`` if not."""
+    """Check that tables and the attitude prior overlap the others in time: ``time-not-covered`` if not."""
     spans = _spans(found)
     first = next((name for name in ("accelerometer", "rates", *found.radars, *found.gnss) if name in spans), None)
     if first is None:
@@ -94,7 +94,7 @@ def _spans(found: Sources) -> dict[str, tuple[float, float]]:
 
 
 def _hours(start: float, stop: float, low: float, high: float) -> str:
-    """Hint that names the whole hours of t0 which would bring a span among the others, if any do."""
+    """Hint with the whole hours by which t0 would have to change, if any bring the span among the others."""
     for hours in range(1, _MOST_HOURS + 1):
         for shift in (3600.0 * hours, -3600.0 * hours):
             if low <= start + shift and stop + shift <= high:
@@ -141,7 +141,7 @@ def _candidates(declared: tuple[str, ...]) -> list[tuple[str, ...]]:
 def _reread(
     record: RadarRecord, declared: tuple[str, ...], units: tuple[str, ...], planet: earth.Planet
 ) -> FloatArray | None:
-    """Positions (n, 3) as other units, or exchanged angles, would have them, ECEF m; None where they cannot be."""
+    """Positions (n, 3), ECEF m, with other units or exchanged angles assumed; None if they are impossible."""
     pairs = [(read_unit(new), read_unit(old)) for new, old in zip(units[:3], declared[:3], strict=True)]
     factor = [new.factor / old.factor for new, old in pairs if new is not None and old is not None]
     values = record.range_az_el * np.array(factor)
@@ -156,7 +156,7 @@ def _reread(
 def _share_that_falls(
     found: Sources, record: RadarRecord, position_m: FloatArray
 ) -> tuple[float | None, tuple[float, float]]:
-    """Share of windows (in coast, where an accelerometer shows it) without force, and their span."""
+    """Fraction of windows without force (in coast, if an accelerometer shows it), and their span."""
     nothing = (np.nan, np.nan)
     force = track_force(record.time_s, position_m, _FALL_WIDTH_S, found.spec.body)
     if force is None:
@@ -229,7 +229,7 @@ def receiver_velocity(found: Sources, record: GnssRecord) -> list[Issue]:
 def tracker_pair(
     trackers: Mapping[str, RadarRecord | GnssRecord], first: str, second: str, planet: earth.Planet
 ) -> tuple[list[Issue], TimeBias | None]:
-    """Compare two trackers where both are.
+    """Compare two trackers over the times that both cover.
 
     Parameters
     ----------
@@ -282,7 +282,7 @@ def _lag_along_motion(
     most_normal_m2: float,
     planet: earth.Planet,
 ) -> tuple[float, float] | None:
-    """Lag of the second's tags, s, and the speed, m/s; None where the distance is not along the motion."""
+    """Lag of the second tracker's tags, s, and the speed, m/s; None if the distance is not along the motion."""
     force = track_force(ta, pa, 4.0, planet) or track_force(ta, pa, _FALL_WIDTH_S, planet)
     if force is None:
         return None

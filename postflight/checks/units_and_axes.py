@@ -31,7 +31,7 @@ def unit_of(source: Source, quantity: Quantity) -> str:
 
 
 def unit_that_explains(ratio: float, unit: str, within: float = _SAME_UNIT) -> str | None:
-    """Return the unit in which values read as ``unit`` would be ``ratio`` times as large; None where there is none.
+    """Return the unit that scales values read as ``unit`` by ``ratio``; None if there is none.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def unit_that_explains(ratio: float, unit: str, within: float = _SAME_UNIT) -> s
 
 
 def unit_hint(declared: str, unit: str | None) -> str:
-    """Return the end of a message that names the unit the numbers fit; empty where that is none or the declared one."""
+    """Return a message's ending that names the matching unit; empty if there is none or it is the declared one."""
     return f": declared in '{declared}', consistent with '{unit}'" if unit not in (None, declared) else ""
 
 
@@ -65,7 +65,7 @@ def all_axes() -> list[Axes]:
 
 
 def axes_matrix(order: Sequence[int], signs: Sequence[int]) -> FloatArray:
-    """Return the matrix (3, 3) that makes body components of the columns."""
+    """Return the matrix (3, 3) from the columns to body components."""
     return np.asarray(np.eye(3)[list(order)] * np.array(signs)[:, None])
 
 
@@ -76,7 +76,7 @@ def axes_named(order: Sequence[int], signs: Sequence[int]) -> str:
 
 @dataclass(frozen=True)
 class TimeBias:
-    """How late ``source``'s time tags are against ``against``'s, s, with one standard deviation."""
+    """Delay of ``source``'s time tags against ``against``'s, s, with one standard deviation."""
 
     source: str
     against: str
@@ -90,7 +90,7 @@ class TimeBias:
 
     @property
     def is_sharp(self) -> bool:
-        """Whether it is known well enough to be shown."""
+        """Whether the standard deviation is small enough to show the time bias."""
         return self.sd_s < _SHARP_S
 
     @property
@@ -128,7 +128,7 @@ def clock_remarks(biases: list[TimeBias], onboard: Sequence[str]) -> list[Issue]
 
 
 def _signs(clock: Sequence[str], biases: list[TimeBias]) -> FloatArray:
-    """How much later each pair's first is against its second where this clock is late by one."""
+    """Change of each pair's time bias per unit delay of this clock: 1, 0 or -1."""
     return np.array([float(b.source in clock) - float(b.against in clock) for b in biases])
 
 

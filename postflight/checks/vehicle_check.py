@@ -1,4 +1,4 @@
-"""Is a vehicle file the vehicle that is meant, and can it fly as it stands?
+"""Does a vehicle file describe the intended vehicle, and can that vehicle fly as stated?
 
 Numbers that an engineer knows by heart and a wrong sign or unit spoils: mass and c.g., ballistic coefficient ``m / (C_A
 S)``, centre of pressure and static margin at small angles, free-free frequency of the joint, and from the static model
@@ -45,7 +45,7 @@ console = terminal()
 
 @dataclass(frozen=True, repr=False)
 class VehicleCheck(Tabular):
-    """What a vehicle file states, in numbers and as a drawing; `check_vehicle` makes it.
+    """Numbers and drawing of a vehicle file; made by `check_vehicle`.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def read_vehicle(name: str | Path) -> ShownVehicle:
 
 
 def check_vehicle(vehicle: Vehicle, pressure_pa: float = 0.0, mach: float | None = None) -> VehicleCheck:
-    """Work out a vehicle's numbers and name what cannot be meant.
+    """Compute a vehicle's numbers and name implausible ones.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def check_vehicle(vehicle: Vehicle, pressure_pa: float = 0.0, mach: float | None
 
 
 def mass_states(vehicle: Vehicle) -> dict[str, Vehicle]:
-    """The vehicle as it starts, and after each step of its mass properties, in the file's order."""
+    """The initial vehicle, and the vehicle after each step of its mass properties, in the file's order."""
     now = replace(vehicle, mass_steps=())
     out = {"at start": now}
     for step in vehicle.mass_steps:
@@ -160,7 +160,7 @@ def mass_states(vehicle: Vehicle) -> dict[str, Vehicle]:
 
 
 def numbers_of(vehicle: Vehicle, slopes: Slopes, pressure_pa: float) -> dict[tuple[str, str], float]:
-    """Numbers of a vehicle by name and unit; NaN where the static model has none."""
+    """Numbers of a vehicle by name and unit; NaN if the static model does not define one."""
     margin, offset = static_margin_m(vehicle, slopes), float(np.hypot(*vehicle.cg_m[1:]))
     critical, trim = np.nan, (np.nan, np.nan)
     if margin > 0.0 and levers(vehicle, slopes)[0] > 0.0:
@@ -188,13 +188,13 @@ def static_margin_m(vehicle: Vehicle, slopes: Slopes) -> float:
 
 
 def vehicle_issues(vehicle: Vehicle) -> list[Issue]:
-    """Name what cannot be meant in any state of the mass properties: c.g. outside, joint behind it, no stability."""
+    """Name what is implausible in any mass state: c.g. outside, joint behind the centerbody's c.g., no stability."""
     issues = [issue for state in mass_states(vehicle).values() for issue in (*_outside(state), *_unstable(state))]
     return list({str(issue): issue for issue in issues}.values())
 
 
 def _outside(vehicle: Vehicle) -> list[Issue]:
-    """C.g.s outside the vehicle's convex hull, and a joint behind the centerbody's."""
+    """C.g.s outside the vehicle's convex hull, and a joint behind the centerbody's c.g."""
     from scipy.spatial import Delaunay  # not for those who only import the program
 
     outline = np.concatenate([outline_station_radius_m(vehicle), outline_station_radius_m(vehicle) * [1.0, -1.0]])
@@ -229,7 +229,7 @@ def outline_station_radius_m(vehicle: Vehicle) -> FloatArray:
 
 
 def _unstable(vehicle: Vehicle) -> list[Issue]:
-    """Mach numbers at which a small angle turns the vehicle further away from the flow."""
+    """Mach numbers at which the vehicle is statically unstable at small angles."""
     length, station = vehicle.reference.length_m, -float(vehicle.cg_m[0])
     slopes = slopes_at(vehicle, vehicle.aero.mach)
     # about the c.g. and per radian; a stable vehicle's is negative
@@ -263,7 +263,7 @@ def _too_soft(found: dict[str, dict[tuple[str, str], float]], pressure_pa: float
 
 
 def is_vehicle(path: Path) -> bool:
-    """Whether a command's argument names a vehicle: a TOML file, or a shipped one where no folder is so called."""
+    """Whether a command's argument names a vehicle: a TOML file, or a shipped vehicle if no folder has that name."""
     return not path.is_dir() and (path.suffix == ".toml" or str(path) in shipped("vehicle"))
 
 

@@ -1,4 +1,4 @@
-"""Which columns of a table are which sensor's, in which unit, and where is the time?
+"""Which columns of a table belong to which sensor, in which unit, and which hold the time?
 
 Quantity and unit come from the header's vocabulary (`postflight.intake.headers`). Where the header leaves a unit
 open, the numbers decide if one unit alone is possible: 9.8 m/s^2 where a vehicle stands, a field of 22 to 67 uT at
@@ -111,7 +111,7 @@ class SourceProposal:
 
 
 def _vector_unit(kind: str, size: FloatArray) -> tuple[str, str]:
-    """Return the unit of vectors of sizes (n,) of a kind, and why; an empty unit with what was seen if that is open."""
+    """Return the unit of vectors of magnitudes (n,), and why; if it is open, an empty unit and the evidence."""
     if not len(size):
         return "", "no numbers"
     if kind == "acceleration":
@@ -131,7 +131,7 @@ def _vector_unit(kind: str, size: FloatArray) -> tuple[str, str]:
 
 
 def column_unit(short: str, kind: str, values: FloatArray) -> tuple[str, str]:
-    """Return the unit of one column (n,), and why; an empty unit with what was seen where that is open."""
+    """Return the unit of one column (n,), and why; if it is open, an empty unit and the evidence."""
     known = values[np.isfinite(values)]
     if not len(known):
         return "", "no numbers"
@@ -205,7 +205,7 @@ def _add(table: FreeFormTable, name: str, cells: list[str]) -> None:
 
 
 def column_names(table: FreeFormTable) -> list[ColumnName]:
-    """Return the table's column names taken apart."""
+    """Return the parsed column names of the table."""
     return [parse_column_name(n, u) for n, u in zip(table.names, table.units, strict=True)]
 
 
@@ -232,7 +232,7 @@ def find_time(table: FreeFormTable, named: list[ColumnName]) -> TimeProposal | N
 
 
 def _coarser(table: FreeFormTable, parts: tuple[str, ...], seconds: list[int]) -> bool:
-    """Whether most rows repeat the time of day of the row before, while a counter of seconds runs on in them."""
+    """Whether most rows repeat the time of day of the previous row while a counter of seconds advances in them."""
     of_day = np.column_stack([table.numbers(table.names.index(c)) for c in parts])
     again = (of_day[1:] == of_day[:-1]).all(axis=1)
     if again.mean() <= 0.5:
@@ -320,7 +320,7 @@ class Recogniser:
         return _named_apart(found), [self.table.names[k] for k in sorted(self.free | self.spare)]
 
     def _time_of_fixes(self) -> TimeProposal | None:
-        """Time of day that a faster log repeats until the next fix: the fix's own; None where there is none."""
+        """Time of day of the fixes, which a faster log repeats until the next fix; None if there is none."""
         if self.time is None or self.time.format != "seconds" or self.time.columns == ("t_s",):
             return None
         parts = _hour_minute_second(self.table, self.named)
@@ -341,7 +341,7 @@ class Recogniser:
         return {key: by_axis for key, by_axis in out.items() if len(by_axis) == 3}
 
     def three_axis_sensors(self) -> list[SourceProposal]:
-        """Accelerometer, gyros, magnetometer."""
+        """Claim the columns of accelerometer, gyros and magnetometer."""
         found: dict[str, SourceProposal] = {}
         for (stem, family), by_axis in self._families().items():
             at = [by_axis[a] for a in range(3)]
@@ -398,7 +398,7 @@ class Recogniser:
         return size[np.isfinite(size)]
 
     def _is_g(self, at: list[int]) -> bool:
-        """Whether ``g`` is no gauss: a small letter, or of a magnitude that the Earth's field has nowhere."""
+        """Whether ``g`` is not gauss: a lower-case letter, or a magnitude that the Earth's field has nowhere."""
         if all(unit_key(self.named[k].unit_text) == self.named[k].unit_text for k in at):
             return True
         size = self._sizes(at)
@@ -406,7 +406,7 @@ class Recogniser:
         return len(size) > 0 and not 0.15 < float(np.median(size)) < 0.9
 
     def may_be_inertial(self) -> bool:
-        """Whether columns that were recognised as nothing differ by x, y, z alone, as an inertial sensor's do."""
+        """Whether unrecognised columns differ by x, y, z alone, as an inertial sensor's do."""
         if self.time is None:
             return False
         unused = {"_".join(self.named[k].tokens): self.named[k].kinds for k in self.free}
@@ -473,7 +473,7 @@ class Recogniser:
         return ColumnProposal(quantity.short, name, unit, how, why)
 
     def _own_noise(self, quantities: tuple[Quantity, ...]) -> list[ColumnProposal]:
-        """Columns with the noise of each row, by their canonical names: what "accuracy" means differs by maker."""
+        """Columns of noise for each row, by canonical names only, since makers differ in the meaning of "accuracy"."""
         found = []
         for quantity in quantities:
             k = next((k for k in sorted(self.free) if self.table.names[k] == quantity.canonical), None)
@@ -484,7 +484,7 @@ class Recogniser:
         return found
 
     def radar(self) -> list[SourceProposal]:
-        """Slant range, azimuth, elevation; angles in whole degrees beside fixes are computed from these."""
+        """Claim slant range, azimuth, elevation; angles in whole degrees beside fixes were computed from these."""
         if not all(self.columns_of(q.short) for q in tables.RADAR):
             return []
         if all(self.columns_of(short) for short in ("lat", "lon")):
@@ -572,7 +572,7 @@ class Recogniser:
         return found, [("height_is", FILL_IN_TOML, '"ellipsoid" or "msl"')]
 
     def _strangeness(self, k: int, beside: list[int]) -> tuple[bool, bool, int, int, bool]:
-        """How little a column has to do with those ``beside`` it: by words, then by place, behind them first."""
+        """Dissimilarity of a column from those ``beside`` it: by words, then by place, columns after them first."""
         own = {t for t in self.named[k].tokens if t.isalpha()} - QUANTITIES["alt"]
         theirs = {t for at in beside for t in self.named[at].tokens} - QUANTITIES["lat"] - QUANTITIES["lon"]
         away = min((abs(k - at) for at in beside), default=0)
@@ -620,7 +620,7 @@ class Recogniser:
         return air and not tracker and bool(self.columns_of("wind_from") or self.columns_of("rho"))
 
     def _certain(self, short: str) -> bool:
-        """Whether a column is named for a quantity in a word, or by a letter with a unit of it."""
+        """Whether a column's name has a full word of the quantity, or a letter with a matching unit."""
         kind = next(q.kind for q in tables.ATMOSPHERE if q.short == short)
         return any(
             kind in self.named[k].kinds or (not self.named[k].kinds and max(map(len, self.named[k].tokens)) > 1)
@@ -628,7 +628,7 @@ class Recogniser:
         )
 
     def _sounding(self) -> list[SourceProposal]:
-        """Columns of a table by altitude, as they are; `postflight.intake.deliveries` derives densities before."""
+        """Columns of a table by altitude, unchanged; `postflight.intake.deliveries` derives densities first."""
         found = list(self.air_columns().values())
         shorts = {m.short for m in found}
         return [SourceProposal("atmosphere", found)] if {"alt", "temperature", "rho"} <= shorts else []
@@ -656,7 +656,7 @@ def _axes_of(tokens: tuple[str, ...]) -> list[tuple[tuple[str, ...], str, int]]:
 
 
 def _named_apart(found: list[SourceProposal]) -> list[SourceProposal]:
-    """Give trackers of one table names of their own, by which results go."""
+    """Give trackers of one table distinct names, by which results are labelled."""
     trackers = [source for source in found if source.section.partition(".")[0] in _ENDINGS]
     for source in trackers if len(trackers) > 1 else ():
         group, _, name = source.section.partition(".")
@@ -665,7 +665,7 @@ def _named_apart(found: list[SourceProposal]) -> list[SourceProposal]:
 
 
 def not_known(named: ColumnName) -> str:
-    """What is said of a unit that is written and not known: it outweighs whatever the numbers look like."""
+    """Message on a stated unit that is not known; it takes precedence over any unit that the numbers suggest."""
     return f"'{named.unit_text}' in the header is no unit that is known"
 
 

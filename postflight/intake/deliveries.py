@@ -1,4 +1,4 @@
-"""What becomes of each delivered file: a telemetry table, a radiosonde, coefficients, video, or nothing?
+"""How is each delivered file used: as telemetry table, radiosonde, coefficients, video, or not at all?
 
 ``postflight import`` reads all files, proposes what each column is, and only then writes: tables to ``telemetry/`` as
 CSV, images and films there as they are, a vehicle file with its tables to ``vehicle/``, coefficient tables beside it
@@ -132,7 +132,7 @@ def _named_in_form(text: str, beside: str) -> str | None:
 
 
 def _how_to_name(table: Path, vehicle: Path, named: bool) -> list[str]:
-    """Sentences on what makes a vehicle take its coefficients from a table."""
+    """Sentences on how a vehicle file names a coefficient table."""
     beside = table.relative_to(vehicle.parent).as_posix()
     by_hand = f'in {vehicle} write  [aerodynamics]  table = "{beside}"  and take [aerodynamics.sphere_cone] out'
     return [
@@ -195,7 +195,7 @@ def radiosonde_table(table: FreeFormTable) -> FreeFormTable | None:
 
 
 def _missing_of_a_radiosonde(found: dict[str, ColumnProposal]) -> str:
-    """What of a radiosonde has no column or no known unit, in words; empty where nothing is missing."""
+    """Columns or known units missing for a radiosonde, in words; empty if there are none."""
     known = {short for short, column in found.items() if column.unit}
     without = [f"the unit of '{column.column}'" for column in found.values() if not column.unit]
     without += [f"a column of {short}" for short in sorted(_RADIOSONDE - set(found))]
@@ -226,7 +226,7 @@ def _dew_point(recogniser: Recogniser) -> FloatArray | None:
 
 
 def _between(at: FloatArray, values: FloatArray, whole: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-    """Values with the missing ones taken from their neighbours along ``at``, and which those are."""
+    """Values with missing ones interpolated along ``at``, and the mask of these."""
     known = whole & np.isfinite(values)
     out = values.copy()
     if known.sum() < 2:
@@ -242,7 +242,7 @@ def _between(at: FloatArray, values: FloatArray, whole: np.ndarray) -> tuple[Flo
 
 @dataclass(frozen=True)
 class Video:
-    """A folder of pictures or a film, where it comes from and where it goes; ``names`` are the pictures'."""
+    """Folder of pictures or film, its source and destination; ``names`` are the pictures'."""
 
     source: Path
     place: Path
@@ -264,7 +264,7 @@ def _video_of(path: Path, telemetry: Path) -> Video | None:
 
 
 def _copy(video: Video) -> None:
-    """Copy pictures or film beside their place and rename, so that they are whole or not there."""
+    """Copy pictures or film beside their destination and rename, so that they are complete or absent."""
     video.place.parent.mkdir(parents=True, exist_ok=True)
     with writing(video.place, "choose a folder that you may write to"):
         if video.is_film:
@@ -283,7 +283,7 @@ def _copy(video: Video) -> None:
 def frame_list(
     table: FreeFormTable, videos: Iterable[Video], cameras: Iterable[str], folder: Path
 ) -> SourceProposal | None:
-    """Return what a list of frames is for, its column named ``frame``; None where the table is no such list.
+    """Return the purpose of a list of frames, its column named ``frame``; None if the table is no such list.
 
     Parameters
     ----------
@@ -384,7 +384,7 @@ def _span(table: FreeFormTable, time: TimeProposal) -> str:
 
 @dataclass
 class _Delivery:
-    """What came: tables, videos, new files, the vehicle file anew, and what is left out, with why."""
+    """Delivered tables, videos, new files, the changed vehicle file, and what is left out, with the reason."""
 
     tables: list[FreeFormTable] = field(default_factory=list)
     videos: list[Video] = field(default_factory=list)
@@ -463,7 +463,7 @@ def _print_placeholders(folder: Path) -> None:
 
 
 def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
-    """Sort and read what was delivered; `GateError` with every table that cannot be read."""
+    """Sort and read the delivered files; `GateError` with every table that cannot be read."""
     came = _Delivery()
     faults: list[str] = []
     lacking: list[str] = []  # libraries that are not installed
@@ -573,7 +573,7 @@ def _place(folder: Path, table: FreeFormTable) -> Path:
 def _proposals(
     came: _Delivery, places: list[Path], folder: Path, tables: dict[str, Any]
 ) -> tuple[str, list[tuple[FreeFormTable, list[SourceProposal], list[str]]], list[Issue]]:
-    """Text to add to flight.toml, what to print, and what of the tables is not used, with why."""
+    """Text to add to flight.toml, output to print, and unused parts of the tables, with the reason."""
     taken = _sections(tables)
     added, shown, unrecognised, unused_tables = [], [], [], []
     videos = [*came.videos, *_earlier_videos(folder)]
@@ -614,7 +614,7 @@ def _proposals(
 
 
 def _question(section: str, taken: set[str]) -> str:
-    """Why a proposed table may not be wanted beside those that are ``taken``; empty where it is."""
+    """Question why a proposed table may be unwanted beside those that are ``taken``; empty if there is none."""
     if section in taken:
         return f"[{section}] is there already. Which is right? Take one out."
     if section == "loads" and any(name.startswith(("radars.", "gnss.", "sensors.")) for name in taken):
@@ -641,7 +641,7 @@ def _not_recognised(table: FreeFormTable, file: str) -> Issue:
 
 
 def _rest_text(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> str:
-    """``[start]`` where accelerometer and gyros with known units and seconds begin with a rest; else nothing."""
+    """Text of ``[start]`` if accelerometer and gyros with known units and seconds begin at rest; else empty."""
     records = {
         source.section: record
         for table, found, _ in shown
@@ -689,7 +689,7 @@ def _sections(tables: dict[str, Any]) -> set[str]:
 
 
 def _print_proposals(shown: list[tuple[FreeFormTable, list[SourceProposal], list[str]]]) -> None:
-    """Print a table for each file: column, quantity, unit, and why; below it what was changed and not used."""
+    """Print a table for each file: column, quantity, unit, and why; then the changes and the unused columns."""
     for table, found, unused in shown:
         screen = Table(title=escape(table.label), title_justify="left")
         for name in ("column", "as", "unit", "how", "why"):

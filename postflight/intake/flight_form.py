@@ -199,7 +199,7 @@ def section_text(source: SourceProposal, file: str, notes: list[str], question: 
 
 
 def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[str]) -> str:
-    """Return what the tables need besides: an attitude, or a model of motion where there are no inertial sensors.
+    """Return the text of what the tables still lack: an attitude, or a motion model without inertial sensors.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def start_text(sections: set[str], tables: dict[str, Any], unrecognised: list[st
 
 
 def _ballistic_question(tables: dict[str, Any]) -> str:
-    """Return the question about an earlier ``[motion]``, once inertial sensors are there."""
+    """Return a question about an existing ``[motion]`` once inertial sensors are imported."""
     motion = tables.get("motion")
     if not isinstance(motion, dict) or motion.get("model") != "ballistic":
         return ""
@@ -280,7 +280,7 @@ def _units_of(short: str) -> list[str]:
 
 
 def _one_line(text: str) -> str:
-    """Text that is safe in a comment."""
+    """Text made safe for a comment: one line."""
     return re.sub(r"[\x00-\x1f\x7f]", " ", text)
 
 

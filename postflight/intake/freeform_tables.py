@@ -1,4 +1,4 @@
-"""How is a text table read that somebody else wrote? In any layout.
+"""How is a text table of unknown layout read?
 
 Any delimiter, comments, a preface, a row of units, decimal commas, old encodings, columns between dashed rules. The
 table is where most columns stand: names, then three rows of numbers of the same count. Files of programs (spreadsheets,
@@ -62,13 +62,13 @@ class FreeFormTable:
     raw: bytes | None = None
 
     def numbers(self, column: int) -> FloatArray:
-        """Return a column (n,) as float64; what is no number is NaN."""
+        """Return a column (n,) as float64, NaN for cells that are not numbers."""
         cells = (row[column] if column < len(row) else "" for row in self.rows)
         out = np.array([plain_number(cell) for cell in cells], dtype=float)
         return np.where(np.abs(out) < _LARGEST, out, np.nan)
 
     def cells(self, column: int, rows: int | None = None) -> list[str]:
-        """Return a column's cells that are not empty, of its first ``rows``."""
+        """Return a column's non-empty cells among the first ``rows``."""
         return [row[column] for row in self.rows[:rows] if column < len(row) and row[column]]
 
     def as_csv(self) -> bytes:
@@ -84,7 +84,7 @@ class FreeFormTable:
 
 @contextmanager
 def refusing_unfit(path: Path) -> Iterator[None]:
-    """Turn what a file cannot be opened for into a `GateError`: it is missing, too large, or none."""
+    """Turn errors on opening a file into a `GateError`: it is missing, too large, or not a file."""
     try:
         yield
     except FileNotFoundError:
@@ -203,7 +203,7 @@ def _decoded(path: Path, raw: bytes) -> tuple[str, list[str]]:
 
 
 def _is_comment(line: str, delimiter: str | None) -> bool:
-    """Whether a line is a comment; where semicolons part the cells, an empty first cell makes none."""
+    """Whether a line is a comment; with semicolons as delimiters, an empty first cell does not make one."""
     return bool(_COMMENT.match(line)) and not (delimiter == ";" and line.lstrip().startswith(";"))
 
 

@@ -42,7 +42,7 @@ _EVERY_TOKEN = {token for tokens in (*QUANTITIES.values(), *VECTORS.values(), AX
 
 @dataclass(frozen=True)
 class ColumnName:
-    """A column's name taken apart: tokens of what it is, and the unit's text where it names one."""
+    """Parsed column name: tokens of its meaning, and the unit's text if it names one."""
 
     name: str
     tokens: tuple[str, ...]
@@ -50,7 +50,7 @@ class ColumnName:
 
     @property
     def _stated(self) -> tuple[str, ...]:
-        """Units that the stated text may mean, as flight.toml takes them; none where it is not known."""
+        """Units that the stated text may mean, as flight.toml takes them; none if it is not known."""
         key = unit_key(self.unit_text)
         if key in UNIT_SPELLINGS or not key or key in SEVERAL_MEANINGS:
             return UNIT_SPELLINGS.get(key, ())
@@ -68,7 +68,7 @@ class ColumnName:
 
     @property
     def unknown_unit(self) -> str:
-        """Text that stands where a unit does and is none that is known; empty where there is none such."""
+        """Text in place of a unit that is not a known unit; empty if there is none."""
         return "" if self._stated else self.unit_text
 
 
@@ -78,7 +78,7 @@ def _kind(unit: str) -> str:
 
 
 def parse_column_name(name: str, unit_row: str = "") -> ColumnName:
-    """Return tokens and unit of a column's name; a row of units below the header goes before the name's own."""
+    """Return tokens and unit of a column's name; a row of units below the header takes precedence over the name."""
     base, unit = name.strip(), ""
     bracket = re.match(r"^(.*?)\s*[(\[{<]\s*([^()\[\]{}<>]+?)\s*[)\]}>]\s*$", base)
     if bracket and bracket[1]:
@@ -102,7 +102,7 @@ def _is_suffix(head: str, key: str) -> bool:
 
 
 def matching(tokens: tuple[str, ...], vocabulary: set[str]) -> set[str]:
-    """Return the tokens in a vocabulary, whole or cut short (``azim``) where that is no token of its own."""
+    """Return the tokens in a vocabulary, whole or abbreviated (``azim``) if the short form is no token of its own."""
     cut = {t for t in tokens if len(t) >= 3 and t not in _EVERY_TOKEN}
     return set(tokens) & vocabulary | {t for t in cut if any(w.startswith(t) and len(w) >= 6 for w in vocabulary)}
 

@@ -69,7 +69,7 @@ _AIR = {"mach", "dynamic_pressure", "airspeed"}
 
 @dataclass
 class FoundColumns:
-    """Columns of a table by the short names of their quantities; what is open or contradicts is among the faults."""
+    """Columns of a table by the short names of their quantities; open or contradictory ones are among the faults."""
 
     table: FreeFormTable
     found: dict[str, ColumnProposal] = field(default_factory=dict)
@@ -78,12 +78,12 @@ class FoundColumns:
     time_s: FloatArray | None = None  # where they were read from clock times
 
     def leave_open(self, short: str, words: str, code: str, column: str = "NAME") -> None:
-        """Keep what is wrong with a quantity's column, and how to state it."""
+        """Record the fault of a quantity's column, and how to state it."""
         how = f"state it, as columns={{'{short}': '{column}:UNIT'}}, --column {short}='{column}:UNIT' or in flight.toml"
         self.faults.append(Issue(f"{self.table.label}: {words}; {how}", code))
 
     def add(self, proposal: ColumnProposal) -> None:
-        """Take a column, which is a fault where its unit is not known."""
+        """Add a column; an unknown unit is a fault."""
         if self.found.setdefault(proposal.short, proposal) is proposal and not proposal.unit:
             words = f"column '{proposal.column}' ({proposal.short}): its unit of {kind_of(proposal.short)} is open"
             why = f" ({proposal.why})" if proposal.why else ""
@@ -97,7 +97,7 @@ class FoundColumns:
 
     @property
     def missing(self) -> list[str]:
-        """Quantities without a column that loads cannot be made without."""
+        """Required quantities of loads that have no column."""
         there = set(self.found) | (set() if self.time_s is None else {"t"})
         if there >= set(MOTION):
             there.add("airspeed")
@@ -118,7 +118,7 @@ def kind_of(short: str) -> str:
 
 
 def find_columns(table: FreeFormTable, chosen: dict[str, str], time_s: FloatArray | None = None) -> FoundColumns:
-    """Every quantity that the table holds; ``chosen`` are columns that are stated, with units behind a colon.
+    """Find every quantity that the table holds; ``chosen`` are stated columns, with units after a colon.
 
     ``time_s`` (n,) are its times where they are known.
     """
@@ -175,7 +175,7 @@ def _find_time(recogniser: Recogniser, out: FoundColumns) -> None:
 
 
 def _take_stated(recogniser: Recogniser, short: str, text: str, out: FoundColumns) -> None:
-    """A quantity whose column, and unit behind a colon, is stated."""
+    """Take a quantity whose column, with unit after a colon, is stated."""
     table, (name, _, unit) = recogniser.table, text.rpartition(":") if ":" in text else (text, "", "")
     if name not in table.names:
         words = f"{short}: no column '{name}'{nearest_name(name, table.names)}"
@@ -191,7 +191,7 @@ def _take_stated(recogniser: Recogniser, short: str, text: str, out: FoundColumn
 
 
 def _take_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: FoundColumns) -> None:
-    """One quantity by the words of its header, the first of them that a column has."""
+    """Find one quantity by its header words; the first word that matches a column decides."""
     wants_sd = short.endswith("_sd")
     fitting = [k for k in sorted(recogniser.free) if _is_sd(recogniser.named[k]) == wants_sd]
     for word in meaning.words:
@@ -211,7 +211,7 @@ def _take_scalar(recogniser: Recogniser, short: str, meaning: _Meaning, out: Fou
 
 
 def _stem(named: ColumnName, short: str) -> str:
-    """Words of a name in one, without those that say whose it is or that it is a standard deviation."""
+    """Words of a name joined, without those for its frame or for a standard deviation."""
     said = {"sd", "sigma", "std", "deg", "body", "cg", "geodetic", "geometric"} | (
         set() if short.startswith("wind") else {"wind"}
     )

@@ -1,4 +1,4 @@
-"""What does another team's file say of the flight? Positions, velocities, attitude and their covariance over time.
+"""What does another team's file state about the flight? Positions, velocities, attitude and their covariance over time.
 
 - CCSDS Orbit Ephemeris Message (KVN, versions 1 to 3): states and covariances, Earth-fixed, UTC.
 - Tables as `postflight.intake.stored_tables` reads them (CSV, NetCDF, Parquet, MATLAB, spreadsheets). Columns of
@@ -78,7 +78,7 @@ class OtherTrajectory:
     notes: tuple[str, ...]
 
     def part(self, keep: BoolArray, left_out: str) -> OtherTrajectory:
-        """States of a mask (n,), with a note of what is left out where that is any; covariances stay."""
+        """States of a mask (n,), with a note if any are left out; covariances stay."""
         if keep.all():
             return self
         columns = ("time_s", "position_ecef_m", "velocity_ecef_mps", "q_ecef_body")
@@ -118,7 +118,7 @@ def read_other(path: Path, epoch_utc: str) -> OtherTrajectory:
 
 
 def _near_earth(path: Path, found: OtherTrajectory) -> OtherTrajectory:
-    """Leave out states whose place is none of a flight, and say so."""
+    """Leave out states whose position is not plausible for a flight, and report them."""
     distance_m = np.linalg.norm(found.position_ecef_m, axis=1)
     keep = (distance_m > _NEAR_M[0]) & (distance_m < _NEAR_M[1])
     if len(keep) and not keep.any():
@@ -262,7 +262,7 @@ def _columns(table: FreeFormTable, names: tuple[str, ...]) -> FloatArray | None:
 
 
 def _by_name(path: Path, table: FreeFormTable, epoch: datetime) -> OtherTrajectory | None:
-    """What a table with the columns of ``bet.csv`` holds; None for any other."""
+    """Trajectory from a table with the columns of ``bet.csv``; None for any other table."""
     notes = list(table.notes)
     position = next((p for names in _POSITIONS if (p := _columns(table, names)) is not None), None)
     geodetic = _columns(table, ("lat_deg", "lon_deg", "alt_m"))
@@ -315,7 +315,7 @@ def _assembled(
     sd: FloatArray | None,
     notes: list[str],
 ) -> OtherTrajectory:
-    """Rows that are whole; what is nowhere known is None."""
+    """Complete rows; a quantity without any value is None."""
     velocity, attitude = (None if v is None or not np.isfinite(v).any() else v for v in (velocity, attitude))
     parts = [position, *(v for v in (velocity, attitude) if v is not None)]
     keep = np.isfinite(time_s) & np.isfinite(np.column_stack(parts)).all(axis=1)
@@ -334,7 +334,7 @@ def _assembled(
 
 
 def _by_vocabulary(path: Path, table: FreeFormTable, epoch: datetime, refused: list[str]) -> OtherTrajectory | None:
-    """What a table holds that is recognised as a receiver's is; None where it is none, with units that are missing."""
+    """Trajectory from a table with a receiver's columns, else None; with the missing units."""
     found, _ = Recogniser(table).proposals()
     source = next((s for s in found if s.section.startswith("gnss.")), None)
     if source is None or source.time is None:

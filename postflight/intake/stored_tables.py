@@ -1,4 +1,4 @@
-"""How is a table read that a program stored? Spreadsheets, Parquet, NetCDF and HDF5, MATLAB files; text otherwise.
+"""How is a table in a binary format read? Spreadsheets, Parquet, NetCDF and HDF5, MATLAB files; text otherwise.
 
 What a file is, its first bytes say. Only numbers, times and texts are read, no objects, no formulas, no macros.
 
@@ -128,7 +128,7 @@ def _guarded(
     unreadable: str = "file-unreadable",
     missing: str = "package-missing",
 ) -> list[FreeFormTable]:
-    """Tables of a file; whatever a library says of a damaged one becomes a refusal with the code ``unreadable``."""
+    """Tables of a file; any error of a library on a damaged file becomes a refusal with the code ``unreadable``."""
     try:
         tables = read(path)
     except GateError:
@@ -145,7 +145,7 @@ def _guarded(
 
 
 def missing_library(fault: ImportError) -> str:
-    """What installs the optional library that could not be imported, in words; any other fault is raised again."""
+    """Command that installs the missing optional library, in words; any other import error is raised again."""
     name = (fault.name or "").partition(".")[0]
     if name not in EXTRAS:
         raise fault
@@ -153,7 +153,7 @@ def missing_library(fault: ImportError) -> str:
 
 
 def _check_readable(path: Path, kind: str) -> None:
-    """Refuse a file that the library of its kind does not come to the end of, or dies of."""
+    """Refuse a file that hangs or crashes the library of its kind."""
     limit_s = _READ_S + path.stat().st_size / _READ_BYTES_PER_S
     command = [sys.executable, "-c", _READ_THROUGH[kind], str(path)]
     try:
@@ -174,7 +174,7 @@ def _check_size(path: Path, numbers: int) -> None:
 
 
 def _cells(values: NDArray[Any]) -> list[str]:
-    """Texts of a column (n,): numbers whole, nothing for NaN, times as ISO UTC."""
+    """Cell texts of a column (n,): numbers at full precision, empty for NaN, times as ISO UTC."""
     if values.dtype.kind == "M":
         return ["" if np.isnat(v) else f"{np.datetime64(v, 'us')}Z" for v in values]
     if values.dtype.kind in "iub":
@@ -360,7 +360,7 @@ def _attribute(attributes: dict[str, Any], name: str) -> str:
 
 
 def _unpacked(values: NDArray[Any], attributes: dict[str, Any]) -> tuple[NDArray[Any], bool]:
-    """Values (n,) by fill value, scale and offset of the conventions, and whether that changed anything."""
+    """Values (n,) with the conventions' fill value, scale and offset applied, and whether that changed anything."""
     packed = {name: float(np.ravel(attributes[name])[0]) for name in _PACKED if name in attributes}
     gaps = [np.ravel(attributes[name]) for name in ("_FillValue", "missing_value") if name in attributes]
     missing = np.isin(values, np.concatenate(gaps)) if gaps else np.zeros(len(values), dtype=bool)
@@ -409,7 +409,7 @@ def _matlab(path: Path, tree: Tree) -> list[FreeFormTable]:
 
 
 def _columns(tree: Tree, parent: str, left_out: list[str]) -> Iterator[tuple[str, FloatArray | None, Column]]:
-    """Columns of a structure and of those in it: name of the structure, times of the column's own, the column."""
+    """Columns of a structure and its substructures: name of the structure, the column's own times, the column."""
     units, names = _first(tree, _UNITS), _first(tree, _NAMES)
     own = {k: v for k, v in tree.items() if v is not units and v is not names}
     vectors = [name for name, value in own.items() if _is_vector(value)]

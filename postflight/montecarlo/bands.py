@@ -1,4 +1,4 @@
-"""Which percentiles and bands have the outputs of a study, and how certain are they with so many flights?
+"""Which percentiles and bands do the outputs of a study have, and how certain are they with so many flights?
 
 Chunks on disk: ``chunk-000012.npz`` holds runs, reasons of those that failed, times of divergence, the named numbers as
 float64 and the histories as float32. Files are whole or absent, with the same bytes from the same flights; a damaged
@@ -138,7 +138,7 @@ BAND_BYTES = 64 * 1024**2
 
 @dataclass(frozen=True)
 class Merged:
-    """Answers of a study: tables of flights, percentiles and bands, and counts."""
+    """Results of a study: tables of flights, percentiles and bands, and counts."""
 
     flights: pd.DataFrame
     percentiles: pd.DataFrame
@@ -194,7 +194,7 @@ def _percentiles(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
 
 
 def _bands(study: Study, folder: Path, wanted: Sequence[Sequence[int]], flown: NDArray[np.bool_]) -> pd.DataFrame:
-    """Percentiles of every history at every time; as many times at once as fit into memory."""
+    """Percentiles of every history at every time, computed in blocks of times that fit into memory."""
     time_s, names = study.plan.window.history_time_s(), study.plan.histories
     count, points = int(flown.sum()), len(time_s)
     columns = ["history", "time_s", "flights", *BAND_COLUMNS]
@@ -214,7 +214,7 @@ def _bands(study: Study, folder: Path, wanted: Sequence[Sequence[int]], flown: N
 def _slabs(
     folder: Path, wanted: Sequence[Sequence[int]], shape: tuple[int, int, int]
 ) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """Histories of all flights that flew, ``(names, times, flights)``, some times after the others.
+    """Histories of all successful flights, ``(names, times, flights)``, block by block in time.
 
     Chunks hold flight by flight what is wanted time by time. Where not all fits into memory the histories are turned
     round on disk, in a file as large as the chunks, so that every chunk is read once, however many there are.
@@ -242,7 +242,7 @@ def _slabs(
 
 
 def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Histories ``(names, times, flights)`` of the flights that flew in some chunks, ``first`` and those after it."""
+    """Histories ``(names, times, flights)`` of the successful flights in consecutive chunks from ``first`` on."""
     out, count = np.empty((*shape, sum(map(len, wanted))), dtype=np.float32), 0
     for number, runs in enumerate(wanted, first):
         chunk = read_chunk(folder, number, runs)
@@ -256,7 +256,7 @@ def _turned(folder: Path, wanted: Sequence[Sequence[int]], first: int, shape: tu
 
 
 def coverage(table: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """Share of errors inside one and two of their standard deviations, by estimator, and the mean NEES of nine."""
+    """Fraction of errors within one and two standard deviations, by estimator, and the mean NEES of nine states."""
     out: dict[str, dict[str, float]] = {}
     for column in table.columns:
         name = column.removesuffix("_error_deg")

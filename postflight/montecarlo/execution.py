@@ -124,7 +124,7 @@ MOST_DIFFERENCES = 12
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked of a study: the number of flights, a stop rule, workers or a scheduler."""
+    """Requested size and execution of a study: number of flights, stop rule, workers or scheduler."""
 
     flights: int
     workers: int = 1
@@ -211,7 +211,7 @@ def _check_same(folder: Path, held: dict[str, Any], asked: dict[str, Any]) -> No
 
 
 class _Enough:
-    """Stop rule, evaluated on whole chunks from the first on, in order of run number."""
+    """Stop rule, evaluated on complete chunks in order of run number."""
 
     def __init__(self, study: Study, stop: Stop | None, flights: int) -> None:
         self.study, self.stop, self.flights = study, stop, flights
@@ -237,7 +237,7 @@ class _Enough:
 
 
 def run(study: Study, folder: Path, wanted: Wanted, report: Progress) -> int:
-    """Fly what is missing of a study; return how many flights it has: those wanted, or fewer where these are enough.
+    """Fly the missing flights; return the study's number of flights: as wanted, or fewer if the stop rule is met.
 
     The stop rule takes flights in the order of their numbers, so it stops at the same flight on any number of workers;
     flights beyond it are removed.

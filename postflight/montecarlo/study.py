@@ -1,4 +1,4 @@
-"""What is a Monte Carlo study, and which draws does each run have?
+"""What defines a Monte Carlo study, and which draws does each run have?
 
 A study is a dispersions file with its scenario. Two studies are the same where their settings are: everything but the
 number of flights and the stop rule.
@@ -57,7 +57,7 @@ TRIAL_SCALARS = (
 
 
 class Outputs(Section):
-    """Recorded of every flight: named numbers, and histories for the bands."""
+    """Recorded outputs of every flight: named numbers, and histories for the bands."""
 
     scalars: tuple[str, ...]
     histories: tuple[str, ...] = ()
@@ -73,7 +73,7 @@ class Stop(Section):
 
 
 class DispersionsFile(Dispersions):
-    """The whole of a dispersions file."""
+    """Complete content of a dispersions file."""
 
     scenario: str
     flights: Flights = 1000
@@ -117,11 +117,11 @@ class Study:
         return range(first, min(first + self.spec.chunk, flights))
 
     def chunks(self, flights: int) -> int:
-        """Return how many chunks so many flights are."""
+        """Return the number of chunks for this number of flights."""
         return -(-flights // self.spec.chunk)
 
     def settings(self) -> dict[str, Any]:
-        """All settings that determine the numbers, flat: key to value."""
+        """All settings that affect the results, as flat keys and values."""
         scenario = self.plan.scenario
         out = _flat("", self.spec.model_dump(mode="json", exclude={"flights", "stop", "scenario"}))
         out |= _flat("scenario.", scenario.spec.model_dump(mode="json"))

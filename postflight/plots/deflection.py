@@ -132,7 +132,7 @@ def figure_deflection(flown: DeflectionHistory | Deflections | Run) -> Figure:
 
 
 def _top_deg(answers: Deflections) -> float:
-    """Where an axis of deflections ends, deg."""
+    """Upper limit of an axis of deflections, deg."""
     largest = [np.nanmax(np.rad2deg(h.theta_rad)) for h in answers.histories.values() if np.isfinite(h.theta_rad).any()]
     return 1.25 * float(max(largest, default=5.0))
 
@@ -298,7 +298,7 @@ def figure_increments(flown: AeroIncrements | Deflections) -> Figure:
 
 
 def _increments(flown: Deflections) -> AeroIncrements:
-    """Increments that answers hold, or that are estimated of them."""
+    """Increments of the answers; estimated if the answers hold none."""
     found = with_increments(flown) if isinstance(flown, Deflections) and flown.increments is None else flown
     if isinstance(found, Deflections) and found.increments is not None:
         return found.increments

@@ -31,7 +31,7 @@ from postflight.runs import Run
 
 
 def deflection_at(history: DeflectionHistory, time_s: float) -> tuple[float, float]:
-    """Angle and plane, rad, in the frame of that time; zero where it has no answer or less than a fit resolves."""
+    """Angle and plane, rad, in the frame at that time; zero without an answer or below the resolution of a fit."""
     k = int(np.argmin(np.abs(history.time_s - time_s)))
     theta, plane = float(history.theta_rad[k]), float(history.plane_lv_rad[k])
     # less than a fit resolves: the benchmark frame where it was taken as undeflected
@@ -158,7 +158,7 @@ def write_overlay_film(
 
 @contextlib.contextmanager
 def _without_standard_error() -> Iterator[None]:
-    """Let nothing through to standard error that libraries write there past Python."""
+    """Suppress standard error output that libraries write there past Python."""
     try:
         kept = os.dup(2)
     except OSError:  # closed

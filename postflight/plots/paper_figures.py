@@ -70,7 +70,7 @@ def trajectory_angle(ax: Axes, air: AirData | Flow, label: str) -> None:
 def fit_height(
     ax: Axes, air: AirData | Flow, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
 ) -> None:
-    """Let an axis of angles, deg, end above those lines, by their label's start, that the window shows."""
+    """Fit the top of an angle axis, deg, to the visible part of lines whose labels start with ``of``."""
     first, last = window(air)
     lines = [
         np.asarray(line.get_xydata(), dtype=np.float64) for line in ax.lines if str(line.get_label()).startswith(of)
@@ -243,7 +243,7 @@ def figure_2_5(flown: Drawable) -> Figure:
 
 @in_style
 def figure_2_7(flown: Drawable, history: DeflectionHistory | None = None) -> Figure:
-    """The same with the accelerometers rotated by the estimated deflection, and the trajectory less it (Figure 2.7).
+    """Figure 2.5 with the accelerometers rotated by the estimated deflection, and the trajectory less it (Figure 2.7).
 
     Parameters
     ----------

@@ -158,12 +158,12 @@ def figure_joints(scenario: Scenario, number: str = "3.1", study: JointStudy | N
 
 
 class WithBounds(Protocol):
-    """What has bands of dispersed entries with the joint locked, and flexible: a `Reconciliation`."""
+    """Object with bands of dispersed entries, joint locked and flexible: a `Reconciliation`."""
 
     bet: Reconstruction
 
     def bounds(self) -> tuple[Bounds, Bounds]:
-        """Fly both."""
+        """Fly both sets of entries."""
         ...
 
 
@@ -219,7 +219,7 @@ def figure_preflight(
 
 @in_style
 def figure_shell_test(found: ShellTest, title: str) -> Figure:
-    """Load against angle, measured and by the selected law and a straight spring; what each leaves over time."""
+    """Load against angle, measured, by the selected law and by a linear spring; residuals of both over time."""
     figure = Figure(figsize=(7.2, 3.4))
     ax, left = figure.subplots(1, 2)
     test, selected = found.selected.test, found.selected

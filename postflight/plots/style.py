@@ -117,7 +117,7 @@ def in_style(draw: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _without_tex(figure: Figure) -> None:
-    """Draw all texts as they stand, but for the ticks, which a logarithmic axis writes as TeX itself."""
+    """Draw all texts literally except the tick labels, since a logarithmic axis writes these as TeX."""
     from matplotlib.axis import Axis
     from matplotlib.text import Text
 
@@ -140,12 +140,12 @@ def band(
 
 
 def legend_above(ax: Axes, ncols: int, title: str | None = None) -> None:
-    """Legend between the axes and what is above them, where no data are."""
+    """Place the legend between the axes and what is above them, off the data."""
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=ncols, borderaxespad=0.0, title=title)
 
 
 def with_holes(time_s: FloatArray, columns: Iterable[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
-    """Put a NaN into every hole of a history, so that no line is drawn across; what a hole is: `DeflectionHistory`."""
+    """Insert NaN into every hole of a history, so that no line is drawn across; see `DeflectionHistory` for holes."""
     import pandas as pd  # the strokes and colours alone need none
 
     columns = list(columns)
@@ -191,7 +191,7 @@ def drawn_unit(unit: str) -> tuple[float, str]:
 
 
 def note(figure: Figure, words: str) -> None:
-    """Write in the lower right corner what was flown."""
+    """Write the flight's description in the lower right corner."""
     figure.supxlabel(words, x=0.995, ha="right", fontsize=7, color=COLOUR["note"], parse_math=False)
 
 
@@ -202,7 +202,7 @@ def flight_words(name: str, synthetic: bool, changes: tuple[str, ...] = ()) -> s
 
 
 def titled(figure: Figure, title: str, words: str) -> Figure:
-    """Figure with its title, and in its corner the words that say what was flown."""
+    """Figure with its title, and the flight's description in its corner."""
     figure.suptitle(title)
     note(figure, words)
     return figure
@@ -239,13 +239,13 @@ def save(figure: Figure, path: str | Path | IO[bytes]) -> None:
 
 
 class FigureWarning(RuntimeWarning):
-    """A figure that was not drawn, and why; everything else of the run is as it would be with it."""
+    """Warning that a figure was not drawn, and why; all other results of the run are unaffected."""
 
     code = "figure-failed"
 
 
 def draw(path: Path, figure: Callable[_P, Figure], *args: _P.args, **named: _P.kwargs) -> None:
-    """Draw and `save` a figure; one that fails costs itself alone, with a `FigureWarning`.
+    """Draw and `save` a figure; a failure affects that figure alone and issues a `FigureWarning`.
 
     Raises
     ------

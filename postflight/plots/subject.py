@@ -37,19 +37,19 @@ class Flow(NamedTuple):
 
 
 def lacking(figure: str, given: object, part: str, *wanted: str) -> GateError:
-    """Refusal of something that has not what a figure draws."""
+    """Error for an argument that lacks the data of a figure."""
     return GateError(f"{figure}: {type(given).__name__} has no {part}; pass {' or '.join(wanted)}", "argument-type")
 
 
 def source_of(given: object) -> object:
-    """What deflections were made from, trajectory or loads; anything else is its own source."""
+    """Trajectory or loads from which deflections were made; anything else is its own source."""
     if isinstance(given, Deflections):
         return given.loads if given.bet is None else given.bet
     return given
 
 
 def bet_of(figure: str, given: object) -> Reconstruction | Run:
-    """Trajectory, and what it was made from; `GateError` where there is none."""
+    """Reconstruction or run that holds the trajectory; `GateError` if there is none."""
     bet = source_of(given)
     if isinstance(bet, Reconstruction | Run):
         return bet
@@ -57,7 +57,7 @@ def bet_of(figure: str, given: object) -> Reconstruction | Run:
 
 
 def reconstruction_of(figure: str, given: object, part: str) -> Reconstruction:
-    """Reconstruction as it was computed, which alone has a part; `GateError` where there is none."""
+    """Computed reconstruction, the only source of a part that runs do not store; `GateError` if there is none."""
     bet = source_of(given)
     if isinstance(bet, Reconstruction):
         return bet
@@ -142,5 +142,5 @@ def words_of(given: object) -> str:
 
 
 def time_label(given: object) -> str:
-    """Label of a time axis: times of a table or a film alone have a zero of their own."""
+    """Label of a time axis; times of a table or film without a flight have their own zero."""
     return TIME if isinstance(source_of(given), Reconstruction | Run | AirData) else "time (s)"

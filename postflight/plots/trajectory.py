@@ -53,7 +53,7 @@ def figure_flown(flown: Drawable) -> Figure:
 
 @in_style
 def figure_residuals(flown: Drawable) -> Figure:
-    """Innovations of each source and component that were tried, with the predicted 3-sd lines; edited points marked.
+    """Tested innovations of each source and component, with predicted 3-sd lines and edited points marked.
 
     Parameters
     ----------

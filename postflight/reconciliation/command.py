@@ -85,7 +85,7 @@ class Reconciliation(Tabular):
 
     @cached_property
     def consistency_checks(self) -> tuple[Check, ...]:
-        """Whether the fit can be believed."""
+        """Checks whether the fit is credible."""
         return credibility(self.fit, _modes(self.bet, self.fit)[0])
 
     @property
@@ -262,7 +262,7 @@ def _print_posterior(posterior: Posterior) -> None:
 
 
 def dispersed(fit: JointFit) -> tuple[JointDispersions, Vehicle]:
-    """How the fitted joint is dispersed, and the vehicle with it, offset and stability known to their sd."""
+    """Dispersions of the fitted joint and of the vehicle with it; offset and stability have their posterior sd."""
     joint, offset, stability = posterior_sd(fit)
     # a joint that is only known to be stiff is flown no stiffer than the simulator's steps can follow
     vehicle = fit.vehicle if stiffness_bound(fit) is None else integrable(fit.vehicle, SLOW_JOINT)
@@ -322,7 +322,7 @@ def credibility(fit: JointFit, modal: ModalStiffness | None = None) -> tuple[Che
 
 
 def _residuals(fit: JointFit) -> Check:
-    """All residuals against chi-square: one each for what was measured, joined and stated, less one a parameter."""
+    """Check of all residuals against chi-square; degrees of freedom: measurements, joins and priors less parameters."""
     problem = fit.problem
     # every parameter but the motion has an a priori residual; of the first motion all but the three rates
     first = problem.motion - 3
@@ -336,7 +336,7 @@ def _residuals(fit: JointFit) -> Check:
 
 
 def _moves(fit: JointFit) -> Check:
-    """Largest move of what is stated of vehicle and instruments, over its a priori sd."""
+    """Largest correction of stated vehicle and instrument values, over its a priori sd."""
     names = fit.problem.vehicle_parameters.names
     stated = np.array([name not in OPEN for name in names])
     moved = np.abs(np.concatenate([fit.parameters.vehicle * stated, fit.parameters.instruments]))
@@ -368,7 +368,7 @@ def _spans(fit: JointFit) -> Check:
 
 
 def _steps(fit: JointFit) -> tuple[Check, ...]:
-    """How far finer integration steps would move an estimate, in its sd; of a joint that is not only bounded.
+    """Shift of an estimate with finer integration steps, in its sd; for a joint with an estimate, not only a bound.
 
     Half a sd widens an interval by an eighth; the fit corrects what is above a tenth.
     """
@@ -386,7 +386,7 @@ def _steps(fit: JointFit) -> tuple[Check, ...]:
 
 
 def _creep(fit: JointFit) -> tuple[Check, ...]:
-    """How many sd of creep the fit is short of, where it has none and the joint is resolved."""
+    """Check for creep that the fit lacks, in its sd, if the joint is resolved."""
     problem = fit.problem
     if problem.motion > MOTION or problem.held:
         return ()
@@ -416,7 +416,7 @@ def _frequency(fit: JointFit, modal: ModalStiffness) -> Check:
 
 
 def _convergence(fit: JointFit) -> Check:
-    """Whether the last step had nothing left to gain."""
+    """Whether the last step could not reduce the cost any further."""
     return Check.of(
         "not-converged", "reconciliation: convergence", float(not fit.converged), 0.0, 0.0,
         f"converged in {fit.steps} steps", f"not converged after {fit.steps} steps",

@@ -1,4 +1,4 @@
-"""Which joint, c.g. offset and static stability explain the flight, and has the joint freeplay, hardening or creep?
+"""Which joint, c.g. offset and static stability explain the flight? Does the joint have freeplay, hardening or creep?
 
 ``max p(parameters | measurements)`` by Gauss-Newton (`gauss_newton`), first with all standard deviations many times
 wider, so that distant starts reach the minimum, at last with the estimated turbulence. The first stiffness is guessed
@@ -141,17 +141,17 @@ class JointFit:
 
     @cached_property
     def creep_scores(self) -> tuple[CreepScore, ...]:
-        """What the linear problem at the solution says of creep with each of `CREEP_TIMES_S`; of a fit without any."""
+        """Linear estimates of creep at the solution for each of `CREEP_TIMES_S`, for a fit without creep."""
         return tuple(_creep_score(self, self.linear, time_s) for time_s in CREEP_TIMES_S)
 
     @cached_property
     def finer(self) -> Problem:
-        """Problem with what fine integration steps predict at the solution."""
+        """Problem with the predictions of fine integration steps at the solution."""
         return self.problem.with_fine_steps(self.parameters)
 
     @cached_property
     def moves_by_steps_sd(self) -> FloatArray:
-        """How far fine integration steps would move each of the parameters sought, (v,), in its sd."""
+        """Shift of each parameter sought, (v,), with fine integration steps, in its sd."""
         fine = self.finer.residuals(self.parameters)
         step = self.normal.solve(self.problem.right_hand_side(self.parameters, self.linear, fine))
         sought = self.problem.vehicle_parameters.sought
@@ -174,12 +174,12 @@ class LawSelection:
 
     @property
     def log_odds(self) -> dict[str, float]:
-        """Of every law that was asked for: logarithm of the odds of a joint with it against one without."""
+        """Log odds of a joint with each requested law against one without it."""
         return {law: having.log_evidence - lacking.log_evidence for law, (lacking, having) in self.compared.items()}
 
 
 def select_laws(flight: Reconstruction, asked: tuple[str, ...] = (), progress: Progress | None = None) -> LawSelection:
-    """Fit the joint; of the laws of `forward_model.LAWS` that are ``asked`` for keep those that the evidence favours.
+    """Fit the joint; of the ``asked`` laws of `forward_model.LAWS`, keep those that the evidence favours.
 
     Raises
     ------
@@ -226,7 +226,7 @@ def select_laws(flight: Reconstruction, asked: tuple[str, ...] = (), progress: P
 
 @dataclass(frozen=True)
 class CreepScore:
-    """What the linear problem about a fit without creep says of creep with one time constant.
+    """Creep with one time constant, estimated by the linear problem about a fit without creep.
 
     Parameters
     ----------
@@ -247,7 +247,7 @@ class CreepScore:
 
 
 def _creep_score(fit: JointFit, plain: Linearization, time_s: float) -> CreepScore:
-    """Step of the delayed compliance from none, all other parameters following, and its sd."""
+    """Delayed compliance and its sd, from one linear step with all other parameters free."""
     problem, start = _without_creep_yet(fit, time_s)
     k = problem.vehicle_parameters.names.index("creep growth")
     normal = problem.normal_equations(start, _linearized_with_creep(fit.problem, plain, problem, start))
@@ -257,7 +257,7 @@ def _creep_score(fit: JointFit, plain: Linearization, time_s: float) -> CreepSco
 
 
 def _linearized_with_creep(plain: Problem, known: Linearization, problem: Problem, start: Parameters) -> Linearization:
-    """Linearize a problem with creep where there is none yet: only what creep adds is flown, all else is known.
+    """Linearize a problem at zero creep: only the columns that creep adds are flown, the others are reused.
 
     Without creep no other parameter moves it, so that the joins' last rows are of creep alone.
     """
@@ -289,7 +289,7 @@ def _without_creep_yet(fit: JointFit, time_s: float) -> tuple[Problem, Parameter
 
 
 def _with_parameters(fit: JointFit, law: str, values: list[float]) -> tuple[Problem, Parameters]:
-    """Problem of a fit with one law more, and the fit's parameters with those of the law; creep nowhere yet."""
+    """Problem of a fit with one more law, and the fit's parameters with those of the law; creep zero everywhere."""
     before = fit.problem.vehicle_parameters
     problem = replace(fit.problem, vehicle_parameters=replace(before, laws=(*before.laws, law)))
     motion = np.zeros((len(fit.parameters.motion), problem.motion))
@@ -374,7 +374,7 @@ def solve(
     correct: Correction | None = None,
     tolerance: float = TOLERANCE,
 ) -> JointFit:
-    """Most probable parameters from a start.
+    """Most probable parameters, from a starting point.
 
     Parameters
     ----------
@@ -404,7 +404,7 @@ def solve(
 
 
 def _refit_with_turbulence(fit: JointFit, report: Progress, correct: Correction | None = None) -> JointFit:
-    """Fit again with the turbulence that the measurements make most probable."""
+    """Fit again with the turbulence of largest evidence."""
     report(0.0, "estimating turbulence")
     air = replace(fit.problem.air, turbulence_share=estimate_turbulence_share(fit.problem, fit.parameters))
     problem = resolved(replace(fit.problem, air=air), fit.parameters.vehicle)
@@ -415,7 +415,7 @@ def _refit_with_turbulence(fit: JointFit, report: Progress, correct: Correction 
 
 
 def _with_fine_steps(fit: JointFit, correct: Correction | None) -> JointFit:
-    """Fit again with what finer integration steps predict, where that moves a parameter that is sought.
+    """Fit again with the predictions of finer integration steps, if they shift a parameter that is sought.
 
     In a vehicle that spins with a joint bent by many degrees the steps' error couples the stiff twist into the bending:
     with 13 to 23 deg at 49 to 60 rpm the damping is 7 to 20 % low (4 to 10 sd).
@@ -428,7 +428,7 @@ def _with_fine_steps(fit: JointFit, correct: Correction | None) -> JointFit:
 
 
 def is_unresolved(problem: Problem, u: Parameters) -> bool:
-    """Whether the joint is too fast for the windows: its stiffness is then bounded, and no step moves it further.
+    """Whether the joint is too fast for the windows, so that its stiffness is only bounded from below.
 
     Neither stiffness nor damping can be determined, and steps along them would go on without gain.
     """
@@ -437,7 +437,7 @@ def is_unresolved(problem: Problem, u: Parameters) -> bool:
 
 
 def estimate_turbulence_share(problem: Problem, u: Parameters) -> float:
-    """Share of the sounding statistics' turbulence at the largest evidence, by the linear problem at ``u``."""
+    """Turbulence as a share of the sounding statistics', at the largest evidence, by the linear problem at ``u``."""
     linear = problem.linearize(u)
     tried = [replace(problem, air=replace(problem.air, turbulence_share=float(share))) for share in SHARES]
     evidence = np.array([_log_evidence(problem, other, u, linear) for other in tried])
@@ -513,7 +513,7 @@ def with_freeplay(problem: Problem, plain: Parameters, freeplay_rad: float, corn
 
 
 def _refit_mismatched(fit: JointFit) -> JointFit:
-    """Fit once more with mismatched spans and their neighbours wide at first."""
+    """Fit once more with wide initial priors on mismatched spans and their neighbours."""
     mismatched = mismatched_spans(fit)
     if not mismatched.any():
         return fit
@@ -536,7 +536,7 @@ def _local_cost(sensors: FloatArray, joins: FloatArray) -> FloatArray:
 
 
 def reconnected(problem: Problem, u: Parameters) -> Parameters:
-    """Start spans from the end of the one before where that lowers the cost; of neighbours one only."""
+    """Restart spans from the end of the previous one if that lowers the cost; only one of two neighbours at a time."""
     predicted = problem.predict(u)
     ends = u.motion.copy()
     ends[1:] = predicted.end[:-1]
@@ -556,7 +556,7 @@ def reconnected(problem: Problem, u: Parameters) -> Parameters:
 
 
 def stiffness_guess(flight: Reconstruction, problem: Problem) -> tuple[Problem, Parameters]:
-    """Start of a fit, nominal but for the stiffness that explains the loaded part of the flight best; its problem.
+    """Starting point of a fit: nominal, with the stiffness that best explains the loaded part; and its problem.
 
     Raises
     ------
@@ -593,7 +593,7 @@ def stiffness_guess(flight: Reconstruction, problem: Problem) -> tuple[Problem, 
 
 
 def resolved(problem: Problem, x: FloatArray) -> Problem:
-    """Problem with integration steps for the joint of the vehicle's parameters (v,)."""
+    """Problem with integration steps that resolve the joint of the vehicle's parameters (v,)."""
     steps = steps_for(problem.vehicle_parameters.vehicle(x))
     if steps == problem.measured.steps:
         return problem
@@ -601,7 +601,7 @@ def resolved(problem: Problem, x: FloatArray) -> Problem:
 
 
 def damping_guess(problem: Problem, x: FloatArray) -> float:
-    """Damping's parameter to start with: a fast joint's is so large that its oscillation decays within a span.
+    """Initial parameter of the damping; large for a fast joint, so that its oscillation decays within a span.
 
     A slightly damped oscillation of many periods a span would fit, badly, at many false frequencies.
     """

@@ -76,7 +76,7 @@ NUISANCE = (
 
 @dataclass(frozen=True)
 class VehicleParameters:
-    """From parameters, in a priori standard deviations, to vehicles.
+    """Map from parameters, in a priori standard deviations, to vehicles.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class VehicleParameters:
 
     @property
     def sought(self) -> int:
-        """How many of them are sought; the others are nuisance parameters."""
+        """Number of parameters sought; the others are nuisance parameters."""
         return len(JOINT) + len(self._of_laws)
 
     @property
@@ -108,7 +108,7 @@ class VehicleParameters:
 
     @property
     def motion(self) -> int:
-        """How many numbers the motion at a span's start has: with creep, that of both lateral axes."""
+        """Number of motion coordinates at a span's start; with creep, its two lateral components are included."""
         creeps = "creep" in self.laws or self.nominal.joint.creep_share > 0.0
         return MOTION + (CREEP_STATES if creeps else 0)
 
@@ -155,7 +155,7 @@ class VehicleParameters:
 
 
 def creep_law(growth: float, settling: float) -> tuple[float, float]:
-    """Share of the compliance that comes late, and its time constant, s, of the two parameters.
+    """Delayed share of the compliance and its time constant, s, from the two parameters.
 
     Rates are 10 1/s at most, time constants 300 s, and the delayed compliance is -0.5 to 9 times the spring's: a joint
     that runs away from its load is none, and a vehicle file has no share above 0.9 and no time constant below 0.1 s.
@@ -195,7 +195,7 @@ def _perturbed(
 
 @dataclass(frozen=True)
 class AtmosphereParameters:
-    """From differences to the sounding to kernel tables.
+    """Map from differences to the sounding to kernel tables.
 
     Differences of log density, north and east wind, m/s, at knots ``(3, k)``; of temperature, K, at knots of its own.
 
@@ -231,13 +231,13 @@ class AtmosphereParameters:
         return np.asarray(np.linalg.inv(sd[:, None] * sounding_correlation(knots, DENSITY_LENGTH_M) * sd))
 
     def knot_spacing_m(self, altitude_m: FloatArray) -> FloatArray:
-        """Distance of the knots about altitudes."""
+        """Spacing of the knots near given altitudes."""
         apart = np.diff(self.knots_m, append=2 * self.knots_m[-1] - self.knots_m[-2])
         return np.asarray(np.interp(altitude_m, self.knots_m, apart))
 
     @cached_property
     def inverse_covariance(self) -> tuple[tuple[FloatArray, FloatArray, FloatArray], ...]:
-        """Of each kind the inverse covariance of the sounding: diagonal (k,), beside it (k - 1,), ``u`` (k,).
+        """Inverse covariance of the sounding by kind: diagonal (k,), off-diagonal (k - 1,), ``u`` (k,).
 
         Half of the variance is a constant bias, which makes ``-u u^T``, half Gauss-Markov along altitude.
         """
@@ -288,7 +288,7 @@ class AtmosphereParameters:
         return table
 
     def moved_rows(self, table: FloatArray, kind: int, knot: int, step: float) -> MovedRows:
-        """Rows of a kernel table that change where log density, north, east wind or temperature moves at one knot."""
+        """Rows of a kernel table that change with log density, north or east wind, or temperature at one knot."""
         near, hat = self._hats[kind == 3][knot]
         rows, change = table[near].copy(), step * hat
         if kind == 0:
@@ -302,13 +302,13 @@ class AtmosphereParameters:
 
     @cached_property
     def _hats(self) -> tuple[list[tuple[slice, FloatArray]], list[tuple[slice, FloatArray]]]:
-        """`hats` of the knots, and of the temperature's."""
+        """`hats` of the atmosphere knots and of the temperature knots."""
         rows_m = self._sounded[1]
         return hats(rows_m, self.knots_m), hats(rows_m, self.temperature_knots_m)
 
 
 def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArray]]:
-    """Of each knot the rows about it, to the knots beside it or the table's end, and what one at the knot is there."""
+    """Linear basis function of each knot: rows up to the neighbouring knots or the table's end, and values there."""
     low = np.maximum(np.searchsorted(rows_m, knots_m[:-1]) - 1, 0).tolist()
     high = (np.searchsorted(rows_m, knots_m[1:]) + 1).tolist()
     near = [slice(*ends) for ends in zip([0, *low], [*high, len(rows_m)], strict=True)]
@@ -318,7 +318,7 @@ def hats(rows_m: FloatArray, knots_m: FloatArray) -> list[tuple[slice, FloatArra
 
 @dataclass(frozen=True)
 class MovedRows:
-    """What one kernel table of the air has instead of another's: ``rows`` (n, 6) from row ``first`` on."""
+    """Changed part of a kernel table of the air: ``rows`` (n, 6) from row ``first`` on."""
 
     first: int
     rows: FloatArray
@@ -363,7 +363,7 @@ FINE = WindowSteps(4, 8)  # resolve the joint's twist too: twice as long they le
 
 
 def steps_for(vehicle: Vehicle) -> WindowSteps:
-    """Steps that resolve a vehicle's bending: a mean of too few records mistakes a fast oscillation for an offset."""
+    """Steps that resolve a vehicle's bending; too few records would alias a fast oscillation into an offset."""
     inertia, _, stiffness = joint_modes(vehicle)["bending"]
     # a window's mean of an oscillation faster than 6 Hz is off by more than half a percent with two intervals
     return SLOW_JOINT if np.sqrt(stiffness / inertia) < 2.0 * np.pi * 6.0 else FAST_JOINT
@@ -537,7 +537,7 @@ class SpanFlights:
     moved: list[MovedRows] = field(default_factory=list)
 
     def air_of(self, flights: Index, rows: slice) -> FloatArray:
-        """Rows of the tables of some flights (k,): (k, n, 6), or (n, 6) where all have table 0."""
+        """Table rows of the air for flights (k,): (k, n, 6), or (n, 6) if all use table 0."""
         whole, tables = self.air[rows], self.table[flights].tolist()
         if not any(tables):
             return whole
@@ -582,7 +582,7 @@ class PredictedSpans:
 
 
 def integrable(vehicle: Vehicle, steps: WindowSteps) -> Vehicle:
-    """Vehicle whose joint the steps can follow and the windows can resolve.
+    """Vehicle with its joint limited to what the steps can integrate and the windows can resolve.
 
     A stiffer spring than the steps can follow leaves a deflection too small to move a sensor. Slightly damped
     oscillations near the windows' Nyquist frequency (12.5 Hz) or beyond it fit at many false frequencies: there the
@@ -677,7 +677,7 @@ def sense(states, aux, vehicle, arms, masses, simpson, window_s, windows, slope)
 
 
 def _parts(flights: int) -> list[slice]:
-    """Parts of the flights that one thread flies in a row, of whole blocks of lanes.
+    """Slices of the flights, in whole blocks of lanes, that one thread flies in sequence.
 
     Handing over a block takes as long as flying it; a large part's air reaches over many spans. The same on every
     machine: where a part's air begins is seen in the last bits.
@@ -689,7 +689,7 @@ def _parts(flights: int) -> list[slice]:
 
 
 def _until_lost(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """States and auxiliaries of some flights, NaN from the first record on that is not finite."""
+    """States and auxiliaries of flights, NaN from the first non-finite record on."""
     if not np.isfinite(states[:, -1]).all():  # what is lost once stays so
         lost = ~np.isfinite(states).all(axis=2)
         lost = np.logical_or.accumulate(lost, axis=1)
@@ -698,7 +698,7 @@ def _until_lost(states: FloatArray, aux: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _rows_passed(measured: Measurements, flights: SpanFlights) -> tuple[Index, Index]:
-    """First row (m,) of the tables of air that each flight needs, and the first (m,) that it does not, two at least.
+    """First row (m,) of the air tables that each flight needs, and one past the last (m,), at least two rows.
 
     A span that leaves them by a trial vehicle's tumbling meets the air at their ends.
     """

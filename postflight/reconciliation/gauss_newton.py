@@ -87,7 +87,7 @@ class Parameters:
 
 
 def stiffness_step(step: float) -> float:
-    """Change of the stiffness's parameter by a step that is straight in the compliance.
+    """Change of the stiffness parameter for a step that is linear in the compliance.
 
     Deflections, and with them the measurements, follow the compliance 1/K: by its logarithm a step from a joint that is
     too stiff would be many times too long. Compliance stays positive: below `LEAST_COMPLIANCE` of what it was it falls
@@ -180,7 +180,7 @@ class Problem:
 
     @cached_property
     def turbulence_rad(self) -> FloatArray:
-        """Flow angle (s,), rad, by atmospheric structure between the knots, times the share of the largest pressure.
+        """Flow angle (s,), rad, from atmospheric structure between the knots, times pressure over its largest value.
 
         The structure between two knots acts for a time that grows with their spacing, and at random from one stretch to
         the next: its effect over a span grows, per angle, with the root of the spacing (docs/reconciliation.md).
@@ -214,7 +214,7 @@ class Problem:
 
     @cached_property
     def join_weight(self) -> FloatArray:
-        """Inverse standard deviations (s - 1, motion) of ends against starts."""
+        """Inverse standard deviations (s - 1, motion) of the gaps between ends and next starts."""
         factor = np.maximum(self._sd_factors[:-1], self._sd_factors[1:])
         more = self.motion - MOTION
         # what a gust does to the deflection comes late for half a span on average
@@ -224,18 +224,18 @@ class Problem:
 
     @property
     def motion_step(self) -> FloatArray:
-        """Steps (motion,) over which derivatives by a span's start are taken."""
+        """Steps (motion,) for the numerical derivatives with respect to a span's start."""
         return np.append(MOTION_STEP, [np.deg2rad(2e-5)] * (self.motion - MOTION))
 
     @property
     def log_weight(self) -> float:
-        """Sum of the logarithms of all weights, those that all models of a flight have in their priors left out."""
+        """Sum of the logarithms of all weights, without prior terms common to all models of a flight."""
         first_creep = -np.log(self.first_creep_sd).sum()
         return float(np.log(self.weight[self.weight > 0.0]).sum() + np.log(self.join_weight).sum() + first_creep)
 
     @property
     def first_creep_sd(self) -> FloatArray:
-        """A priori sd of the creep at the first start, rad, (2,) or none: it is no larger than the deflection."""
+        """A priori sd of the creep at the first start, rad, (2,) or empty; creep is bounded by the deflection."""
         return self.measured.first_deflection_sd[1 : 1 + self.motion - MOTION]
 
     @property
@@ -273,7 +273,7 @@ class Problem:
         return self._predictions([u])[0]
 
     def with_fine_steps(self, u: Parameters) -> Problem:
-        """Problem that predicts at ``u`` what fine integration steps do, and near it the same changes as before.
+        """Problem corrected at ``u`` to fine integration steps; changes near ``u`` are predicted as before.
 
         The twist is critically damped there: it follows its load as before, and does not ring from starts that were
         found with long steps.
@@ -292,7 +292,7 @@ class Problem:
         return [self._corrected(flown) for flown in self._flown(trials)]
 
     def _corrected(self, flown: PredictedSpans) -> PredictedSpans:
-        """Predicted spans with the error of the integration steps taken out."""
+        """Predicted spans corrected for the error of the integration steps."""
         if self.step_error is None:
             return flown
         end = flown.end.copy()
@@ -300,7 +300,7 @@ class Problem:
         return replace(flown, windows=flown.windows + self.step_error.windows, end=end)
 
     def _flown(self, trials: Sequence[Parameters]) -> list[PredictedSpans]:
-        """Spans of several parameters by the problem's own steps, each span's side by side: they share its air."""
+        """Spans of several parameter sets with the problem's own steps, grouped by span so that they share its air."""
         spans, count = self.measured.spans, len(trials)
         number = np.tile(np.arange(count), spans)
         air, *others = [self.air.table(u.air, u.warmer_k) for u in trials]
@@ -339,7 +339,7 @@ class Problem:
         return np.asarray(windows @ gain.T - late * slope)
 
     def residuals(self, u: Parameters, predicted: PredictedSpans | None = None) -> Residuals:
-        """Residuals of measurements, joins and priors; where a span diverges the cost is infinite."""
+        """Residuals of measurements, joins and priors; the cost is infinite if a span diverges."""
         predicted = predicted or self.predict(u)
         errors = self.instrument_response(predicted) @ u.instruments
         sensors = (self.data - predicted.windows - errors) * self.weight
@@ -404,7 +404,7 @@ class Problem:
 
     @cached_property
     def _arranged(self) -> tuple[Index, int, int]:
-        """Rows (count,) of the parameters in the matrix, how many are its band's, and how far that reaches.
+        """Row (count,) of each parameter in the matrix, number of banded rows, and the bandwidth.
 
         First span by span the air that it is the first to pass, from above, and its motion; then vehicle, instruments,
         temperature, and a row for each kind of air. Air that no span passes comes before all spans, or after.
@@ -441,7 +441,7 @@ class Problem:
         return [self.vehicle_parameters.names.index(name) for name in self.held]
 
     def _perturbed(self, u: Parameters, wanted: BoolArray) -> tuple[SpanFlights, list[Index], list[FloatArray]]:
-        """Spans with one of the parameters ``wanted`` moved, which (columns) and by how much, span by span."""
+        """Spans with each ``wanted`` parameter perturbed, its column and step, span by span."""
         v, m = self.first_instrument, self.motion
         vehicles = [self.trial_vehicle(u.vehicle + VEHICLE_STEP * unit) for unit in np.eye(v)]
         vehicles.append(self.trial_vehicle(u.vehicle))
@@ -469,7 +469,7 @@ class Problem:
         return SpanFlights(spans, which, np.concatenate(motions), table, vehicles, air, moved), columns, steps
 
     def _moved_air(self, air: FloatArray, which: Index) -> tuple[list[MovedRows], FloatArray]:
-        """What changes in a kernel table where parameters of the air (k,) move, counted from its first; their steps."""
+        """Changed rows of kernel tables for perturbed air parameters (k,), counted from the first one; their steps."""
         knots = len(self.air.knots_m)
         kinds = np.minimum(which // knots, 3)
         steps = AIR_STEP[kinds]
@@ -482,7 +482,7 @@ class Problem:
 
     @cached_property
     def _nearby_air(self) -> list[Index]:
-        """Parameters of the air, counted from its first, that each span feels."""
+        """Air parameters, counted from the first one, that influence each span."""
         knots = len(self.air.knots_m)
         by_span = zip(self._passed_knots, self._passed(self.air.temperature_knots_m), strict=True)
         return [np.concatenate([near, knots + near, 2 * knots + near, 3 * knots + warm]) for near, warm in by_span]
@@ -512,7 +512,7 @@ KINKED = 1.0
 
 @dataclass(frozen=True)
 class Step:
-    """End of a step, decrease of the cost that the linear problem predicts, residuals at the end, its equations."""
+    """Result of a step: parameters, predicted decrease of the cost, residuals there, and the normal equations."""
 
     end: Parameters
     predicted_decrease: float
@@ -559,7 +559,7 @@ def _better(
     damping: float,
     best: tuple[Residuals, Parameters],
 ) -> tuple[Residuals, Parameters]:
-    """Return the lowest of the best so far and of fractions of one step with its curvature."""
+    """Return the lowest-cost step among the best so far and fractions of one step with its curvature."""
     solved = normal.solver(damping)
     step = solved(normal.right)
     ahead, behind = problem.residuals_of([u.plus(side * LOOK_AHEAD * step) for side in (1.0, -1.0)])
@@ -581,7 +581,7 @@ def descend(
     start: Parameters,
     correct: Callable[[Problem, Parameters], Parameters] | None = None,
 ) -> Iterator[Step]:
-    """Take one step on each problem in turn, each from the end of the one before.
+    """Take one step on each problem in turn, each starting from the end of the previous one.
 
     Parameters
     ----------

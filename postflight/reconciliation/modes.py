@@ -1,6 +1,6 @@
-"""Which stiffness of the joint follows from the frequency of its oscillation alone?
+"""Which stiffness does the joint's oscillation frequency alone imply?
 
-Of the fit it takes only where to look, within a factor of two of its stiffness. Lateral rates and specific force,
+The fit only limits the search to within a factor of two of its stiffness. Lateral rates and specific force,
 rotated into axes that do not spin, are cut into overlapping windows. The logarithm of their spectra over the noise is
 averaged along the frequency ``f(K; q, Mach, V)`` that the linear model (`flightmodel.linear`) predicts for the
 joint's mode in every window, for both senses of rotation. The stiffness ``K`` with the largest mean is the estimate.
@@ -69,7 +69,7 @@ class ModalStiffness:
 
 
 def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalStiffness:
-    """Track the joint's mode through the pressure pulse, with stiffnesses up to twice and down to half of one.
+    """Track the joint's mode through the pressure pulse, for stiffnesses from half to twice a given one.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _spectra(flight: Reconstruction, span_s: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _tracks(nominal: Vehicle, about: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
-    """Frequencies of the joint's mode (factors, n), Hz: between every tenth of `FACTORS` by straight lines."""
+    """Frequencies of the joint's mode (factors, n), Hz, interpolated linearly between every tenth of `FACTORS`."""
     coarse = FACTORS[::10]
     known = np.array([_frequencies(_stiffer(nominal, about * factor), flow)[1] for factor in coarse])
     return np.column_stack([np.interp(np.log(FACTORS), np.log(coarse), column) for column in known.T])
@@ -183,7 +183,7 @@ def _frequencies(vehicle: Vehicle, flow: tuple[FloatArray, FloatArray, FloatArra
 
 
 def _track_power(frequency_hz: FloatArray, log_power: FloatArray, track_hz: FloatArray) -> FloatArray:
-    """Mean of both senses at a track's frequencies, (n,); zero where the mode does not oscillate."""
+    """Mean log power of both senses of rotation at a track's frequencies, (n,); zero if the mode does not oscillate."""
     step = frequency_hz[1]
     known = np.isfinite(track_hz)
     near = np.where(known, np.nan_to_num(track_hz) / step, 0.0)
@@ -206,7 +206,7 @@ def _peak(mean_log_power: FloatArray) -> float:
 
 
 def _vehicle_sd(nominal: Vehicle, factor: float, flow: tuple[FloatArray, FloatArray, FloatArray]) -> float:
-    """Sd of the logarithm of the stiffness by the vehicle's uncertainty, at the same frequency of the joint."""
+    """Sd of the log stiffness due to the vehicle's uncertainty, at a fixed joint frequency."""
     parameters = VehicleParameters(nominal)
 
     def mean_log_hz(x: FloatArray) -> float:

@@ -1,4 +1,4 @@
-"""How is a step of a fit of many spans solved, and what is its covariance?
+"""How is one step of a multi-span fit solved, and what is its covariance?
 
 The parameters of vehicle and instruments are shared by all spans; the motion at a span's start and the air that the
 span falls through have elements in common with theirs and with those of the next spans alone. So the matrix of the
@@ -40,7 +40,7 @@ def add_part(band, across, corner, place, part):
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Normal equations of a step, solved with a diagonal of one.
+    """Normal equations of a step, solved with the diagonal scaled to one.
 
     Parameters
     ----------
@@ -58,13 +58,13 @@ class NormalEquations:
 
     @cached_property
     def _constant(self) -> tuple[Index, FloatArray]:
-        """Rows of no parameter, and their columns."""
+        """Rows that belong to no parameter, and their columns."""
         rows = np.setdiff1d(np.arange(len(self.matrix.diagonal)), self.place)
         return rows, self.matrix.columns(rows - len(self.matrix.across))
 
     @cached_property
     def scale(self) -> FloatArray:
-        """One over the root of the diagonal (m,); of rows of no parameter one."""
+        """Inverse square root of the diagonal (m,); one for rows that belong to no parameter."""
         rows, columns = self._constant
         diagonal = self.matrix.diagonal - (columns**2).sum(axis=1)
         diagonal[rows] = 1.0

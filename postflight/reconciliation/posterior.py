@@ -1,4 +1,4 @@
-"""Which values of stiffness, damping, offset and stability has a fitted joint, and with which uncertainty?
+"""Which stiffness, damping, offset and stability does a fitted joint have, and with which uncertainty?
 
 From the linear problem: covariance ``P = (J^T W J + P_0^-1)^-1`` of all parameters, and by differences the standard
 deviations and 90 % intervals of what an engineer asks for.
@@ -83,7 +83,7 @@ QUANTITIES: tuple[tuple[str, str, Callable[[Vehicle], float], bool], ...] = (
 
 @dataclass(frozen=True)
 class _LinearQuantity:
-    """A quantity that grows with one of the vehicle's parameters: ``nominal + scale x[index]``."""
+    """Quantity that is linear in one of the vehicle's parameters: ``nominal + scale x[index]``."""
 
     label: str
     column: str
@@ -100,7 +100,7 @@ class _LinearQuantity:
 
 
 def _creep_rows(fit: JointFit, reach: float) -> list[tuple[str, str, float, float, float, float, float, str]]:
-    """Rows of `joint_table`: share of the compliance that comes late, and its time constant.
+    """Rows of `joint_table` for creep: delayed share of the compliance, and its time constant.
 
     The interval of the time constant is that of its inverse; it has no end where creep may settle later than any time.
     """
@@ -173,7 +173,7 @@ def joint_table(fit: JointFit) -> pd.DataFrame:
 
 
 def stiffness_bound(fit: JointFit) -> float | None:
-    """Stiffness, N m/rad, that the joint has at least, with 95 %; None where the flight limits it above as well.
+    """Lower 95 % bound of the stiffness, N m/rad; None if the flight limits it above as well.
 
     Measurements follow the compliance 1/K, which they know by a normal law, whatever its size. The a priori law is
     taken out of the posterior; where less than `FROM_ZERO_SD` sd are left between compliance and zero, the joint may as
@@ -303,7 +303,7 @@ def require_sampler() -> None:
 
 @dataclass(frozen=True)
 class Profile:
-    """Cost of candidates of the parameters sought, the others at their most probable.
+    """Profile cost: candidates of the parameters sought, with all others at their most probable values.
 
     A candidate ``(p,)`` is the difference to the best fit in independent standard deviations of the linear problem.
     """
@@ -317,7 +317,7 @@ class Profile:
 
     @cached_property
     def root(self) -> FloatArray:
-        """From a candidate to the parameters sought: root (p, p) of their linear covariance."""
+        """Square root (p, p) of the linear covariance, which maps a candidate to the parameters sought."""
         return np.asarray(np.linalg.cholesky(self.fit.covariance[: self.count, : self.count]))
 
     @cached_property
@@ -330,7 +330,7 @@ class Profile:
         return linear, np.concatenate([self.root, -others.solve(coupling @ self.root)]), others
 
     def one_sided(self, z: FloatArray) -> NDArray[np.bool_]:
-        """Mask (n,) of candidates with freeplay of the best fit's sign: those of the other sign are the same again."""
+        """Mask (n,) of candidates with the best fit's sign of freeplay; the opposite sign gives the same flights."""
         names, best = self.fit.problem.vehicle_parameters.names, self.fit.parameters.vehicle
         if "freeplay" not in names:
             return np.ones(len(z), dtype=bool)
@@ -360,7 +360,7 @@ class Profile:
         return best
 
     def refitted(self, z: FloatArray) -> float:
-        """Cost of a candidate by new steps of all others, with new derivatives."""
+        """Cost of a candidate after new steps of all other parameters, with new derivatives."""
         problem = self.fit.problem
         held = replace(problem, held=problem.vehicle_parameters.names[: self.count])
         cost, u = self.at(z)

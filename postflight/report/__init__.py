@@ -1,3 +1,3 @@
-"""One flight's answer as a page: what a reader sees, from a finished run and the telemetry that it was made from."""
+"""HTML report of one flight, made from a finished run and its telemetry."""
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ console = terminal()
 
 
 def locate(word: str) -> Path:
-    """Return the run folder that a word means.
+    """Return the run folder that an argument names.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def _default_folder(runs: tuple[Run, ...], others: tuple[str, ...]) -> Path:
 
 
 def _write(folder: Path, runs: tuple[Run, ...], tables: dict[str, pd.DataFrame], text: str) -> None:
-    """Write everything beside the folder and rename; an earlier comparison there is replaced, nothing else."""
+    """Write all files beside the folder and rename; only an earlier comparison may be replaced."""
     if folder.exists() and not (folder.is_dir() and {p.name for p in folder.iterdir()} <= _FILES):
         raise GateError(f"{folder}: exists and is no comparison; name another with --output", "file-exists")
     place = folder.resolve()
@@ -248,7 +248,7 @@ def page(compared: RunComparison, over_time: pd.DataFrame) -> str:
 
 
 def _title(compared: RunComparison) -> str:
-    """Return what differs in one line: the fused deflection where every run has it."""
+    """Return the main difference in one line: the fused deflection if every run has it."""
     fused = next((q for q in compared.quantities if q.column == "deflection_fused_deg"), None)
     values = [] if fused is None else [compared.value(k, fused) for k in range(len(compared.runs))]
     if values and np.isfinite(values).all():

@@ -69,7 +69,7 @@ def line_of(
 
 
 def quantities_drawn() -> list[tuple[str, str, str, float, str, str]]:
-    """Of every quantity with a sd: id, title, unit, scale, its column and the column of its sd."""
+    """Every quantity with a sd: id, title, unit, scale, its column and the column of its sd."""
     return [
         (f"{name}_{k}", f"{title}: {label}" if len(lines) > 1 else title, unit, scale, column, sd_column)
         for name, title, unit, scale, _, lines in _TRAJECTORY
@@ -140,7 +140,7 @@ def _raw_accelerations(run: Run) -> dict[str, list[dict[str, Any]]]:
 
 
 def _points(label: str, time_s: FloatArray, values: FloatArray, colour: str, decimals: int, limit: int) -> Panel:
-    """Dots at times of their own, thinned to ``limit`` with every extreme kept; NaN left out."""
+    """Points at their own times, thinned to ``limit`` with all extremes kept; NaN left out."""
     known = np.isfinite(values)
     time_s, values = time_s[known], values[known]
     rows = kept_rows([values], limit) if len(values) else np.empty(0, dtype=int)

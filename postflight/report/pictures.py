@@ -76,7 +76,7 @@ def _strip(name: str, telemetry: Telemetry, table: pd.DataFrame, count: int) -> 
 
 
 def worst_frames(run: Run) -> list[dict[str, Any]]:
-    """Frames that an analyst looks at first, with the outline of the virtual camera's shell; empty without a film.
+    """Frames that an analyst should check first, with the virtual camera's outline; empty without a film.
 
     The outline is drawn at a used frame's own answer (yellow), at its neighbours' where it was refused (grey).
     """
@@ -163,7 +163,7 @@ def _without_near(picks: list[int], wanted: tuple[int, ...]) -> list[int]:
 
 
 def jpegs(pictures: list[Image]) -> list[str]:
-    """Data URIs of RGB pictures ``(h, w, 3)``, as fine as lets all of them together stay small."""
+    """Data URIs of RGB pictures ``(h, w, 3)``, at the best quality for which their total size stays small."""
     small = [narrowed(picture) for picture in pictures]
     out: list[str] = []
     for quality in QUALITIES:

@@ -63,7 +63,7 @@ def title(run: Run) -> str:
 
 
 def _doubt(run: Run) -> str:
-    """What failed checks mean for the answers; empty where all pass."""
+    """Consequences of failed checks for the answers; empty if all pass."""
     return doubt([str(name) for name in run.checks.loc[~run.checks["passed"].astype(bool), "name"]], len(run.checks))
 
 
@@ -81,7 +81,7 @@ def _answer(run: Run) -> str:
 
 
 def _peak_name(run: Run) -> str:
-    """Peak q, or the largest there is where the data end before the peak; of a film alone the time of its answer."""
+    """Name of the peak: peak q, or the largest q if the data end before it; for a film alone, its answer's time."""
     if "peak_dynamic_pressure_pa" not in run.summary:
         return f"{run.peak_s:.2f} s"
     row = run.peak("dynamic pressure")
@@ -117,7 +117,7 @@ def _peak(run: Run) -> str:
 
 
 def rests_on(lines: Iterable[str]) -> list[list[str]]:
-    """Absolute values, each beside what it depends on and no residual shows: rows of a table, of ``rests_on``."""
+    """Rows of a table from ``rests_on``: absolute values and the assumptions that residuals cannot test."""
     return [re.split(r" rests? on (?:the )?", line, maxsplit=1) for line in lines]
 
 
@@ -206,7 +206,7 @@ def _card(run: Run, method: str) -> dict[str, Any]:
 
 
 def _agreement(run: Run, method: str) -> dict[str, str]:
-    """Whether a method agrees with the others, by the tests of every pair; of the fusion, whether all do."""
+    """Agreement of a method with the others, from the pairwise tests; for the fusion, from all tests."""
     table = run.tables.get("fusion_agreement")
     if table is None or not len(table):
         return dict(_ALONE)
@@ -296,7 +296,7 @@ def events(run: Run) -> list[dict[str, Any]]:
 
 
 def main_columns(table: pd.DataFrame) -> pd.DataFrame:
-    """Table without what its CSV alone needs: preflight values, correlations, and times beside Mach numbers."""
+    """Table for the page, without preflight values, correlations, and times beside Mach numbers, which the CSV has."""
     aside = r"correlation_c|.*_preflight$|alpha_shell_deg$" + ("|t_s$" if "mach" in table else "")
     return table[[name for name in table if not re.match(aside, str(name))]]
 

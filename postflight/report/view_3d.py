@@ -87,7 +87,7 @@ def _thinned(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def hole_s(time_s: FloatArray) -> float:
-    """Distance between answers above which nothing is drawn between them, s."""
+    """Largest interval between answers across which a line is drawn, s."""
     return round(HOLE_FACTOR * float(np.median(np.diff(time_s))), 4) if len(time_s) > 1 else 0.0
 
 

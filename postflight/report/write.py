@@ -1,4 +1,4 @@
-"""`postflight report`: one HTML file that needs nothing else, with the same bytes for the same run.
+"""`postflight report`: one self-contained HTML file, identical bytes for the same run.
 
 Which error sizes did flight.toml leave to the defaults, and which does the flight itself show? To paste there.
 
@@ -128,7 +128,7 @@ def write_deflection_report(answers: Deflections, flight: Flight, folder: Path, 
 
 
 def _answer_columns(answers: Deflections) -> pd.DataFrame:
-    """One row a method, without what its card alone says."""
+    """One row per method, without columns that only its card shows."""
     table = answers.to_frame().drop(columns=["reason", "theta_p16_deg", "theta_p50_deg", "theta_p84_deg"])
     names = {str(name): str(name).replace("theta_", "deflection_").replace("_t_s", "_at_s") for name in table}
     return table.rename(columns=names).dropna(axis=1, how="all")
@@ -167,7 +167,7 @@ def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[s
 
 
 def write_whole(target: Path, content: str) -> None:
-    """Write a file that appears at once, or a `GateError` with its name."""
+    """Write a file atomically, or raise `GateError` with its name."""
     with writing(target, "name another place with --output"):
         write_file(target, content)
 
@@ -354,13 +354,13 @@ def _degrees(angle_rad: float) -> float:
 
 
 def assumed(run: Run) -> list[tuple[str, str]]:
-    """Tables of flight.toml with the sizes that they do not state, as the run took them; none of runs of before."""
+    """Tables of flight.toml with the default sizes that the run used for unstated ones; none for older runs."""
     tables = run.header.get("assumed") or {}
     return [(name, ", ".join(f"{key} = {size:g}" for key, size in keys.items())) for name, keys in tables.items()]
 
 
 def measured(run: Run) -> str:
-    """Lines for flight.toml with what the flight shows of its trackers and sensors; empty where it shows nothing."""
+    """Lines for flight.toml with tracker noise and sensor biases estimated from the flight; empty if there are none."""
     out = []
     for group, records in (
         ("radars", run.telemetry.radars), ("gnss", run.telemetry.gnss), ("barometers", run.telemetry.barometers)

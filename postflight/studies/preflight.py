@@ -1,4 +1,4 @@
-"""In which bands did the pre-flight uncertainty expect the flight's angle of attack and normal acceleration?
+"""Which bands did the pre-flight uncertainty predict for the flight's angle of attack and normal acceleration?
 
 The vehicle is flown many times from the reconstructed state above the atmosphere, with mass properties, coefficients,
 damping, density, winds and start attitude dispersed by their pre-flight uncertainty; the bands are percentiles of the

@@ -1,4 +1,4 @@
-"""Which law has a shell's joint, by a load test on the ground?
+"""Which law does a shell's joint follow in a load test on the ground?
 
 A test gives moment (or load) and angle (or displacement) over time. The law is the vehicle file's: a spring ``F = K d +
 K3 d^3``, and creep ``b`` behind it (standard linear solid)::
@@ -174,7 +174,7 @@ class LawFit:
 
     @property
     def rms_share(self) -> float:
-        """Rms of what is left, of the largest displacement."""
+        """Rms residual as a fraction of the largest displacement."""
         return float(np.sqrt(np.mean(self.residual_rad**2))) / self.test.largest_rad
 
     @property
@@ -217,7 +217,7 @@ class ShellTest:
 
     @cached_property
     def selected(self) -> LawFit:
-        """Law of the lowest criterion, its time constant inside the test; rows independent as in the best fit."""
+        """Law with the lowest criterion and its time constant inside the test; independent rows as in the best fit."""
         usable = [fit for fit in self.fits if fit.time_is_inside]
         best = min(usable, key=lambda fit: fit.rms_share)
         independent = max(len(best.residual_rad) / best.together, 2.0)
@@ -298,7 +298,7 @@ def _covariance(slope: FloatArray, keep: float, variance: float) -> FloatArray:
 
 
 def _time_bounds(test: LoadTest) -> tuple[float, float]:
-    """Time constants that a test can tell: from two rows to its length, s."""
+    """Bounds of a time constant that a test can resolve: from two rows to its length, s."""
     return 2.0 * float(np.median(np.diff(test.time_s))), float(np.ptp(test.time_s))
 
 
