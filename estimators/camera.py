@@ -377,7 +377,7 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
 
 def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse frames answered by the edge alone, where it does not contradict features that were found."""
-    words = "no feature agrees where other frames show some that do: whether the edge is the shell's is not known"
+    words = "no feature agrees, though some do in other frames: the edge alone may not be the shell's"
     lost = Issue(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
     return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
@@ -396,7 +396,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
         return without_lost_features(fits)
     if with_texture.sum() >= _LEAST_PAINTED and np.mean(agreed[with_texture]) > _PAINTED * agreed.max():
         return _without_bare(fits)
-    words = "texture agrees where in most frames none does: it may be light and shade, which move as the Sun does"
+    words = "texture agrees, though in most frames none does: it may be shading, which moves with the Sun"
     fault = Issue(words, "texture-strays")
     return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]
 

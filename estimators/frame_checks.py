@@ -246,8 +246,8 @@ def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: fl
         return Issue(words, "picture-warped"), 0.0
     if together + square > _WORST_TOGETHER:
         words = (
-            f"shape, turn and warp of the picture together are improbable (chi-square {together + square:.0f} of "
-            f"{len(shape) + len(turn) + len(warp)}): rows that slip, or edge and features are not the shell's alone"
+            f"shape, turn and warp of the picture are jointly improbable (chi-square {together + square:.0f} of "
+            f"{len(shape) + len(turn) + len(warp)}): rows are displaced, or edge and features are not the shell's alone"
         )
         return Issue(words, "picture-warped"), 0.0
     fault, apart = _fault_of_halves(design)

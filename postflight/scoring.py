@@ -103,7 +103,7 @@ class Limits:
         elif limit is not None and not abs(error) <= limit:
             out.append(Issue(f"{words} {limit:g} {unit}", too_large, name))
         if limit is not None and not sd <= limit:
-            words = f"{name}: sd {sd:.3g} {unit} above the limit of {limit:g} {unit}, which it cannot show to be kept"
+            words = f"{name}: sd {sd:.3g} {unit} above the limit of {limit:g} {unit}: too large to verify the error"
             out.append(Issue(words, "sd-above-limit", name))
         return out
 

@@ -427,7 +427,7 @@ def _residual_checks(residual: FloatArray) -> list[Check]:
         out.append(
             Check.of(
                 "force-residuals", f"air residuals {name}", rms, 0.0, 2.0, "forces follow the model",
-                "forces do not follow the model", advice="check coefficients, and for forces other than aerodynamic",
+                "forces do not follow the model", advice="check the coefficients; look for thrust or contact",
                 source="air", component=name,
             )
         )  # fmt: skip

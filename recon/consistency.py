@@ -334,7 +334,7 @@ def physical_checks(
                 Check.of(
                     "physical-range", f"physical range {name}", outside, 0.0, _MOST_OUTSIDE,
                     f"{found} is possible", f"{found} is outside {low:g} to {high:g}",
-                    advice=f"{advice}, or the range's correction took out more than there was",
+                    advice=f"{advice}, or the range overcorrected it",
                     source=instrument.owner, component=error.states[0],
                 )
             )  # fmt: skip

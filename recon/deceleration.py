@@ -61,8 +61,8 @@ def lateral_checks(telemetry: Telemetry, confidence: float) -> list[Check]:
         Check.of(
             "lateral-reading", f"lateral reading {spec.name}", across / sd, 0.0, most,
             f"{found}, as trim allows", found,
-            advice="its axes are not the body's (state axes), or the vehicle flies at an angle: state trim_sd_deg, and "
-            "side_sd of a lifting one",
+            advice="its axes are not the body's (state axes), or the vehicle trims at an angle: state trim_sd_deg, and "
+            "side_sd of a lifting vehicle",
             source=spec.name,
         )
     ]  # fmt: skip

@@ -315,8 +315,8 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
     return Check.of(
         "sounding-temperature", "sounding temperature", layer.away, 0.0, layer.most,
         f"{found}, within what both may err", found,
-        advice="scale or axis of the accelerometer, rows that are missing with their time, axes, angles and speed of "
-        "the stated state or C_A over Mach number are in error, or the air differed",
+        advice="check scale and axis of the accelerometer, missing rows with their times, the stated state, and C_A "
+        "over Mach number; or the atmosphere differed",
         component=f"temperature at {layer.between}",
     )  # fmt: skip
 

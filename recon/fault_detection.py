@@ -352,7 +352,7 @@ def carried_check(spans: tuple[UnmodelledAcceleration, ...]) -> Check:
     where = ", ".join(f"{d.start_s:.1f} to {d.end_s:.1f} s" for d in spans)
     return Check.of(
         UNMODELLED_CODE, "sensors carry the track", len(spans), 0.0, 0.0, "accelerometer and gyros carry the track",
-        f"an acceleration that they did not measure is needed to follow the track ({where})",
+        f"the track requires an acceleration that accelerometer and gyros did not measure ({where})",
         advice="trackers that lag (time tags, a receiver beyond its dynamics), or sensors that saturate: correct or "
         "exclude these (use_s), or state the span in [[motion.disturbed]]",
     )  # fmt: skip

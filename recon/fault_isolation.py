@@ -406,19 +406,19 @@ def _tracker_hypothesis(failed: list[Check], left_out: tuple[LeftOut, ...], iner
     if len(resolving) > 1:
         distance = max(s.distance_m for s in resolving)
         return Issue(
-            f"{' and '.join(names)} contradict each other by up to {distance:.0f} m: without either the rest is "
-            "consistent, and the data do not show which is wrong; check their sites, calibration and time tags",
+            f"{' and '.join(names)} contradict each other by up to {distance:.0f} m: leaving out either makes all else "
+            "consistent, so the data cannot tell which is wrong; check sites, calibration and time tags of both",
             "trackers-contradict",
             names,
         )
     touched = [s.source for s in left_out if any(is_about(v, s.source) for v in failed)]
     if len(touched) == 1 and not inertial:
         own = _symptoms([v for v in failed if is_about(v, touched[0])])
-        what = f"{touched[0]} ({own}): only its residuals fail, though the rest is not consistent without it"
+        what = f"{touched[0]} ({own}): only its residuals fail, but without it the rest is not consistent either"
         return Issue(what, "tracker-residuals", tuple(touched))
     largest = _inertial(inertial) if inertial else "no data sheet's error stands out"
     return Issue(
-        f"inertial sensors or motion: without no single tracker is the rest consistent; {largest}",
+        f"inertial sensors or motion: leaving out one tracker does not make the rest consistent; {largest}",
         "inertial-or-motion",
         _inertial_sources(inertial),
     )

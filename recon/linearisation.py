@@ -74,7 +74,7 @@ class SpinPhase:
         odds = f"odds of one phase over the next {np.exp(self.odds):.0f} to 1" if self.odds < 14.0 else "one phase fits"
         return Check.of(
             "spin-phase", "phase of the spin", self.odds, _LEAST_ODDS, np.inf, f"{prior}; {odds}", f"{prior}; {odds}",
-            advice="another number of turns explains the data as well: state a later attitude, a surer scale, or use "
+            advice="the number of turns is ambiguous: state a later attitude, a smaller scale_sd of the gyros, or use "
             "magnetometer and Sun sensors (attitude_sensors)", source="rates", component="scale",
         )  # fmt: skip
 

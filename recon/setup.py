@@ -174,7 +174,7 @@ def _named_model(
     """Error model as the settings want it, or every fault of the names in them at once."""
     faults = _unknown_sources(telemetry, settings, trackers)
     if settings.attitude_sensors and sensors is None:
-        remark = "attitude_sensors: ballistic flight has no attitude that they could measure; leave them off"
+        remark = "attitude_sensors: a ballistic motion has no attitude; switch them off"
         faults.append(Issue(remark, "keys-conflict"))
     model = _build_error_model(telemetry, sensors, settings.attitude_sensors)
     try:
@@ -372,8 +372,8 @@ def _span(
         _check_reach(stated.time_s, settings, sensors)
     elif len(t) == 0:
         raise GateError(
-            "no radar or receiver has a usable point that is not left out, nor do angles and ranges of several sites "
-            "meet in one; a trajectory needs at least one",
+            "no radar or receiver has a usable point, and angles or ranges of several sites do not meet in one; a "
+            "trajectory needs at least one",
             code="too-few-data",
         )
     else:
@@ -404,7 +404,7 @@ def _check_reach(state_s: float, settings: Settings, sensors: InertialSensors | 
     if sensors is not None:
         first = max(sensors.force.time_s[0], sensors.rate.time_s[0])
         if first > state_s + 0.1:
-            words = f"accelerometer and gyros begin at {first:.3f} s; carry the state there, and its covariance"
+            words = f"accelerometer and gyros begin at {first:.3f} s; propagate the state and its covariance to there"
     if words:
         raise GateError(f"start.state is of {state_s:.3f} s, but {words}", code="time-not-covered")
 

@@ -183,7 +183,7 @@ def shared_error_check(table: FloatArray, names: list[str], consistent: bool) ->
     words = _amount(component, float(table[worst, 0]))
     return Check.of(
         "sites", "radar sites", float(away[worst]), 0.0, 3.0, "",
-        f"an error of all radar sites together makes all data consistent: stated minus true, {words}",
+        f"one error common to all radar sites would make all data consistent: stated minus true, {words}",
         advice="check survey, height datum and azimuth mark, against the receiver or barometer that differs",
         source=SITES, component=component,
     )  # fmt: skip
@@ -194,7 +194,7 @@ def unchecked_state(telemetry: Telemetry) -> list[Issue]:
     state = telemetry.start.state
     if state is None or telemetry.radars or telemetry.gnss or telemetry.places:
         return []
-    words = "no tracker and no [[places]]: nothing checks this state, its time and axes; state where the vehicle landed"
+    words = "no tracker and no [[places]]: no data check this state, its time and axes; state where the vehicle landed"
     return [Issue(words, "state-unchecked", "start", state.time_s, state.time_s)]
 
 

@@ -140,8 +140,8 @@ def judged_by_the_stated(
         symptom = f"{name}: time tags {_in_words(whole_s)} ± {sd_s:.3f}, set right"
         made = Check.of(
             "clock-corrected", f"time of {name}", whole_s / max(stated_s, sd_s), -limit, limit, symptom, symptom,
-            advice=f"more than stated (time_bias_sd_s = {stated_s:g}); or the inertial sensors' tags, and with them "
-            "the trajectory's, are off as much the other way: check both", source=name, component="time bias",
+            advice=f"it is more than stated (time_bias_sd_s = {stated_s:g}), or the inertial sensors' tags have the "
+            "opposite error: check both", source=name, component="time bias",
         )  # fmt: skip
         checks.append(made)
         findings.append(Issue(symptom, "clock-corrected", name, float(record.time_s[0]), float(record.time_s[-1])))

@@ -260,8 +260,8 @@ def _consistency_checks(fit: Fit, terms: ErrorTerms, confidence: float) -> list[
         out.append(
             Check.of(
                 "attitude-residuals", f"residuals {name}", squares / expected, float(low) - _MISFIT_ALLOWANCE,
-                float(high) + _MISFIT_ALLOWANCE, f"{name}: residuals as large as its noise",
-                f"{name}: residuals are not as large as its noise",
+                float(high) + _MISFIT_ALLOWANCE, f"{name}: residuals match the stated noise",
+                f"{name}: residuals do not match the stated noise",
                 advice="check noise, clocking and interference", source=name,
             )
         )  # fmt: skip

@@ -352,8 +352,8 @@ def require_damping(vehicle: Vehicle) -> None:
     """Refuse a vehicle whose file states no damping of the joint, on which a factor is sought; `GateError`."""
     if not vehicle.joint.bending_damping_nmsprad > 0.0:
         raise GateError(
-            f"reconciliation: the joint of vehicle '{vehicle.name}' has no damping, and a factor on it is sought: "
-            "state joint.bending_damping_nmsprad, of which critical is "
+            f"reconciliation: vehicle '{vehicle.name}' states no damping of its joint, on which the fit estimates a "
+            "factor: state joint.bending_damping_nmsprad; the critical damping is "
             f"{vehicle.critical_damping_nmsprad():.3g}; a rigid vehicle has no joint to reconcile",
             code="joint-undamped",
         )

@@ -99,7 +99,7 @@ def stiffness_from_modes(flight: Reconstruction, about_nmprad: float) -> ModalSt
     if not EDGE <= np.argmax(mean_log_power) < len(FACTORS) - EDGE:
         message = (
             f"modes: from {FACTORS[0] * about_nmprad:.0f} to {FACTORS[-1] * about_nmprad:.0f} N m/rad the power along "
-            "the joint's frequency is largest at an end: the line is another one's"
+            "the joint's frequency has its maximum at an end: the spectral line is not the joint's"
         )
         raise GateError(message, code="not-observable")
     best = _peak(mean_log_power)
@@ -125,7 +125,7 @@ def _check_spin(flight: Reconstruction, joint_hz: FloatArray, time_s: FloatArray
     if spin_hz > MOST_SPIN * mode_hz:
         message = (
             f"modes: the vehicle spins at {60.0 * spin_hz:.0f} rpm, more than {MOST_SPIN:g} of the joint's "
-            f"{mode_hz:.1f} Hz: its frequency is not that of a vehicle that does not spin"
+            f"{mode_hz:.1f} Hz: the model of a vehicle without spin does not apply"
         )
         raise GateError(message, code="spin-too-fast")
 

@@ -320,8 +320,8 @@ def _band_panels(run: Run, bands: pd.DataFrame, prefix: str) -> list[Panel]:
             out.append(one | {"ceiling": round(1.5 * top, 2)} | ({"floor": 0} if unit in ("deg", "g") else {}))
     if not out:
         raise GateError(
-            f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: none of a "
-            f"quantity ({', '.join([*_FLOWN, 'deflection_deg'])}) and time of this flight's pulse",
+            f"bands of {', '.join(sorted(set(bands['quantity'])))} from {span[0]:.0f} to {span[1]:.0f} s: no "
+            f"quantity of this flight ({', '.join([*_FLOWN, 'deflection_deg'])}) during its pulse",
             "time-not-covered",
         )
     return out
