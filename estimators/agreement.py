@@ -158,7 +158,7 @@ class Agreement:
         return self.explained("")
 
     def explained(self, cause: str) -> str:
-        """One sentence; ``cause``: what is found wrong by itself, before which no input is suspected."""
+        """One sentence; ``cause``: an independently found error, which is named before any input is suspected."""
         if not self.pairs:
             return "only one method has an answer: no independent measurement to compare it with"
         failed = [" and ".join(p.methods) for p in self.pairs if not p.passed]
@@ -304,7 +304,7 @@ def _difference(a: Evidence, b: Evidence, deflection: Deflection | None) -> tupl
 def _means(
     one: Evidence, share: FloatArray, deflection: Deflection | None
 ) -> tuple[FloatArray, dict[str, FloatArray], FloatArray]:
-    """What readings have beyond a deflection and its motion, mean of samples (n, 2), of their responses and noise."""
+    """Span means of the readings minus the deflection and its motion (n, 2), of their responses and of their noise."""
     off = one.theta_yz_rad
     if deflection is not None:
         off = off - deflection(one.time_s)

@@ -1,4 +1,4 @@
-"""What forces and moments does a deflected vehicle need to move as the centerbody's sensors say it moved?
+"""Forces and moments that a deflected vehicle needs for the motion that the centerbody's sensors measured.
 
 Momentum and angular momentum of two rigid bodies that turn against each other about the joint, exact in the deflection
 and in the rates. Body axes are the centerbody's; ``R(theta)`` turns shell axes into them, with ``rho`` the shell's c.g.
@@ -64,7 +64,7 @@ class Swing:
 
     @classmethod
     def held(cls, theta_yz_rad: FloatArray) -> Swing:
-        """Deflection that does not move."""
+        """Constant deflection, with zero rate and acceleration."""
         still = np.zeros_like(theta_yz_rad)
         return cls(theta_yz_rad, still, still)
 
@@ -329,7 +329,7 @@ def _moment(v, state, w, turning):
 
 @kernel
 def moment_left(v, swing, pressure, rate, turning, flow, mach, airspeed, knots, table, out):
-    """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g., body y, z, m; see above."""
+    """Aerodynamic minus required transverse moment over ``q S C_A``, as a c.g. shift, body y, z, m; see above."""
     for i in range(len(out)):
         state, w = _state(swing, i), _vector(rate[i], 0)
         turn = _axes(state[0], state[1])
@@ -364,7 +364,7 @@ def moment_left(v, swing, pressure, rate, turning, flow, mach, airspeed, knots, 
 
 
 def moment_residual(vehicle: Vehicle, swing: Swing, loads: FlightLoads) -> FloatArray:
-    """Transverse moment of the air less the motion's over ``q S C_A``, a shift of the c.g.; body y, z (n, 2), m.
+    """Aerodynamic minus required transverse moment over ``q S C_A``, as a c.g. shift; body y, z (n, 2), m.
 
     Parameters as of `force_residual`.
     """
@@ -386,7 +386,7 @@ def _table(vehicle: Vehicle) -> tuple[FloatArray, FloatArray]:
 
 
 def _numbers(vehicle: Vehicle, loads: FlightLoads) -> FloatArray:
-    """What the kernels know of a vehicle, as they lay it out."""
+    """Parameters of a vehicle in the kernels' layout."""
     shell, body = vehicle.aeroshell, vehicle.centerbody
     upper = np.triu_indices(3)
     return np.concatenate(

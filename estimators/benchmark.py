@@ -245,7 +245,7 @@ def _with_marked(oriented: OrientedCamera, benchmark: EditedFrame) -> OrientedCa
 def _with_features(
     oriented: OrientedCamera, features: Features, benchmark: EditedFrame, sd_px: float, first: int
 ) -> OrientedCamera:
-    """Add features, from row ``first`` on new, which lie in the benchmark frame exactly where they were taken from."""
+    """Add features from row ``first`` on, whose position in the benchmark frame is exact by construction."""
     pixels = oriented.view.sight(features.points_shell_m, np.zeros(3)).pixels
     new = (np.arange(len(pixels)) >= first) & benchmark.is_clear(np.nan_to_num(pixels, nan=-1.0))
     found = np.einsum("ni,ni->n", pixels, features.across_px), np.where(new, sd_px, np.inf)
@@ -257,7 +257,7 @@ def _oriented(
     nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd,
     features_of: Callable[[VirtualCamera], ImageFeatures],
 ) -> OrientedCamera:  # fmt: skip
-    """Fit from the nominal pose and, where that is not sound, near it alone and from where the feature map fits.
+    """Fit from the nominal pose and, if the result is poor, again with short reaches and from the feature map's pose.
 
     The edge seen from far may have been the Earth's; features and the valleys between tori are the shell's alone.
     """
@@ -290,7 +290,7 @@ def _starts(
 
 
 def _turn_seen(nominal: VirtualCamera, benchmark: EditedFrame, prior: FloatArray, apriori: AprioriSd) -> str:
-    """How the camera would have to be turned for the shell to be seen where it should be; empty where no turn fits."""
+    """Camera rotation, as text, that would bring the shell to where it is expected; empty if no rotation fits."""
     best: tuple[float, FloatArray] | None = None
     for turn in _TURNS_RAD:
         view = replace(nominal, camera=nominal.camera.turned(turn, 1.0))
@@ -423,7 +423,7 @@ def _share_found(look: _Look, features: Features) -> float:
 
 
 def samples_together(residual: FloatArray) -> float:
-    """How many neighbours in a row of residuals (n,) err together: one and twice the sum of its autocorrelation.
+    """Correlated samples in a row of residuals (n,): one plus twice the sum of the autocorrelation.
 
     The sum ends where the autocorrelation first is not positive.
     """
@@ -471,7 +471,7 @@ def _posed(nominal: VirtualCamera, pose: FloatArray) -> VirtualCamera:
 
 
 def _moved_lens(camera: Camera, pose: FloatArray) -> dict[str, FloatArray]:
-    """What else than rotation and focal scale poses (..., 12) change of a camera."""
+    """Parameters of a camera other than rotation and focal scale, moved by poses (..., 12)."""
     k1_k2 = np.zeros((*pose.shape[:-1], len(camera.distortion)))
     k1_k2[..., :2] = pose[..., 6:8]
     return {
@@ -659,7 +659,7 @@ def benchmark_deflection(frames: RelativeDeflections, loads: FlightLoads, prior_
 
 
 def _measured(at_s: FloatArray, time_s: FloatArray) -> BoolArray:
-    """Whether there are samples close to both sides."""
+    """Mask of times with samples close by on both sides."""
     after = np.searchsorted(time_s, at_s).clip(1, len(time_s) - 1)
     inside = (at_s >= time_s[0]) & (at_s <= time_s[-1])
     return np.asarray(inside & (time_s[after] - time_s[after - 1] < _LONGEST_HOLE_S))

@@ -89,7 +89,7 @@ class BodyEdge:
     place_px: FloatArray
 
     def moved(self, picture: KeptPicture, clear: BoolArray) -> MountMotion:
-        """How the edge has moved since. ``clear`` (n,): lines that nothing hides."""
+        """Motion of the edge since the benchmark frame. ``clear`` (n,): unobstructed lines."""
         moved = _places(picture, self.lines) - self.place_px
         seen = clear & np.isfinite(moved)
         moved = moved[seen]
@@ -145,7 +145,7 @@ def _lines(view: VirtualCamera) -> ScanLines | None:
 
 @inlined
 def _scatter(grey, begin, plain, last):
-    """Standard deviation of ``plain`` samples from the first; the last one counts for those behind it."""
+    """Standard deviation of ``plain`` samples from ``begin`` on; beyond the end the last sample is repeated."""
     mean, square = 0.0, 0.0
     for j in range(plain):
         mean += grey[min(begin + j, last - 1)]

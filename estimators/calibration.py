@@ -1,4 +1,4 @@
-"""What are a lens's focal length, principal point and distortion, by the corners of a flat checkerboard in pictures?
+"""Focal length, principal point and distortion of a lens from pictures of a flat checkerboard's corners.
 
 OpenCV finds, from some twenty pictures, the lens that minimises the corners' distances, each picture with a pose of
 its own. Corners of one picture err together (a bent board, blur, light, what the lens's model leaves out there), so the
@@ -165,7 +165,7 @@ def calibrate_lens(corners: pd.DataFrame, size_px: tuple[int, int], lens: Lens =
 
 
 def _sd(residual: FloatArray, jacobian: FloatArray, unknowns: int, readings: Sequence[int]) -> FloatArray:
-    """Standard deviations (unknowns,) of the lens, by what the fit would be without each picture.
+    """Jackknife standard deviations (unknowns,) of the lens: the fit is repeated without each picture.
 
     Raises
     ------
@@ -189,7 +189,7 @@ def _sd(residual: FloatArray, jacobian: FloatArray, unknowns: int, readings: Seq
 
 
 def _check_condition(jacobian: FloatArray) -> None:
-    """Refuse a fit of which some unknowns can be changed together and no corner moves."""
+    """Refuse an ill-conditioned fit, in which some unknowns can change together without moving any corner."""
     size = np.linalg.norm(jacobian, axis=0)
     # not by the normal matrix, whose condition number is the square
     if not size.all() or np.linalg.cond(jacobian / np.where(size > 0.0, size, 1.0)) > _LARGEST_CONDITION:

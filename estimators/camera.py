@@ -208,7 +208,7 @@ class FilmFit:
         return "the vehicle file's features" if own else "seams and dots"
 
     def _remark(self, benchmark: BenchmarkDeflection | None) -> str:
-        """What was assumed, how much of the shell was in view, and which frames were refused."""
+        """Remark on assumptions, share of the shell in view, and refused frames."""
         used, oriented = [fit for fit in self.fits if not fit.refused], self.oriented
         edge = np.median([len(fit.horizon.points_px) for fit in used]) / len(oriented.lines.origin_px) if used else 0.0
         features = float(np.median([fit.features for fit in used])) if used else 0.0
@@ -243,7 +243,7 @@ class FilmFit:
 
 
 def _spans(times_s: list[float]) -> str:
-    """One time, or how many from the first to the last."""
+    """Text: one time, or the first time, the last, and their number."""
     if len(times_s) == 1:
         return f"{times_s[0]:.3f} s"
     return f"{len(times_s)} between {times_s[0]:.3f} and {times_s[-1]:.3f} s"
@@ -370,13 +370,13 @@ def judged(
 
 
 def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse frames answered by the edge alone in a film of which most frames show features that agree with it."""
+    """Refuse edge-only frames in a film in which most frames have features that agree with the edge."""
     with_features = [fit.features > 0 for fit in fits if not fit.refused]
     return fits if np.mean(with_features or [False]) < _MOST else _without_bare(fits)
 
 
 def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse frames answered by the edge alone, where it does not contradict features that were found."""
+    """Refuse edge-only frames, except those whose edge contradicts features that were found."""
     words = "no feature agrees, though some do in other frames: the edge alone may not be the shell's"
     lost = Issue(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
@@ -402,7 +402,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
 
 
 def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
-    """Refuse what is left of a film of which most frames that show anything show no shell: those may fit by chance."""
+    """Refuse the remaining fits if most frames with anything visible show no shell: those may fit by chance."""
     shown = [fit for fit in fits if getattr(fit.refused, "code", "") not in _OF_PICTURE]
     refused = float(np.mean([bool(fit.refused) for fit in shown] or [False]))
     if len(shown) < _LEVEL_FRAMES or refused <= _MOST:
@@ -459,7 +459,7 @@ class JointSwing:
     damping_ratio: float
 
     def largest_change(self, level_rad: FloatArray, apart_s: FloatArray) -> FloatArray:
-        """Largest change of deflection (n,), rad, in a time (n,) about a level that a sudden load would hold it at.
+        """Largest change of deflection (n,), rad, in a time (n,) of free oscillation after a sudden load of this level.
 
         Released from zero, the joint overshoots the level by ``exp(-pi zeta / sqrt(1 - zeta^2))`` of it; between two
         times it moves by no more than ``2 sin(w t / 2)`` of that amplitude, twice of it from half a period on.
@@ -471,7 +471,7 @@ class JointSwing:
 
 
 def without_jumps(time_s: FloatArray, fits: list[FrameFit], swing: JointSwing) -> list[FrameFit]:
-    """Refuse frames whose deflection no swing of the joint connects with the answered frames on both sides.
+    """Refuse frames whose deflection jumps by more than the joint's free oscillation allows between answered frames.
 
     The level is the median of the angle over the answered frames nearest in time; what the errors of both frames
     explain (3 sd) is no jump.

@@ -1,4 +1,4 @@
-"""What is seen of the shell in a frame, and what does it say of the deflection?
+"""What of the shell is found in a frame, and which deflection follows from it?
 
 Where the shell is may be known from the frame before; else it is sought: where most features are found, where the edge
 is from far, where the map of features or of the valleys between tori fits (behind the rim may be the Earth, whose limb
@@ -120,7 +120,7 @@ _NOTHING = no_horizon(NO_FAULT)
 
 @dataclass(frozen=True)
 class _Approached:
-    """What is seen from near an answer: texture that agrees, the edge, and the share of each."""
+    """Texture and edge found from a starting point near an answer, and the share of each."""
 
     place: tuple[FloatArray, FloatArray] | None
     edge: HorizonLine
@@ -130,7 +130,7 @@ class _Approached:
 
     @property
     def score(self) -> float:
-        """Texture that agrees outweighs an edge, which may be the Earth's."""
+        """Score by which starting points are ranked: agreeing texture outweighs an edge, which may be the Earth's."""
         return self.edge_share + (1.0 + self.agreed if self.place is not None else 0.0)
 
 
@@ -206,7 +206,7 @@ class OrientedCamera:
 
     @property
     def painted_rows(self) -> int:
-        """How many rows of the features, the first, are painted ones."""
+        """Number of leading feature rows that are painted ones."""
         return 0 if self.painted is None else len(self.painted.across_px)
 
     @property
@@ -226,14 +226,14 @@ class OrientedCamera:
         return self._edge_at_benchmark / max(len(self.clocks_rad), 1)
 
     def _edge_share(self, points: int) -> float:
-        """So many edge points over those of the benchmark frame; none where that shows no edge."""
+        """Number of edge points relative to the benchmark frame's; zero if that has none."""
         there = self._edge_at_benchmark
         return points / there if there else 0.0
 
     def _at_benchmark(
         self, index: NDArray[np.intp], beside: int = 0
     ) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
-        """Of points found at the benchmark too, or so many places beside it: residual (NaN where not), sd, its row."""
+        """Benchmark residual (NaN if not found there), sd and row of points, or of places ``beside`` them."""
         if beside:
             return self._nearest_at_benchmark(index, beside)
         offset, sd, at = self._every_place_at_benchmark
@@ -369,7 +369,7 @@ class OrientedCamera:
 
     @cached_property
     def _light_shift(self) -> FloatArray:
-        """Of rows (n, 3), painted features: texture leaves out what the light may shift, and an analyst sees marks."""
+        """Light shift of rows (n, 3), non-zero for painted features only: texture and marked features exclude it."""
         painted = np.arange(len(self.features.across_px)) < self.painted_rows
         return np.where(painted[:, None], light_shift(self.view, self.features), 0.0)
 
@@ -422,7 +422,7 @@ class OrientedCamera:
 
     @cached_property
     def _edge_rms_px(self) -> float:
-        """Of the edge in the benchmark frame."""
+        """Rms residual of the edge in the benchmark frame, px."""
         edge = self.benchmark_residuals.residual_px[self._benchmark_edge]
         return float(np.sqrt(np.mean(edge**2))) if len(edge) else float("inf")
 
@@ -524,7 +524,7 @@ class OrientedCamera:
     def _explained(
         self, place: tuple[FloatArray, FloatArray] | None, deformation: FloatArray, both: Solution
     ) -> tuple[Solution, float]:
-        """Edge and features, or most features alone if clouds along the edge pass for a shape; else `NoFitError`.
+        """Solution by edge and features, or by most features alone if clouds pass for the edge; else `NoFitError`.
 
         Last: variance by a motion of the picture that may be.
         """
@@ -537,7 +537,7 @@ class OrientedCamera:
         return alone, self._check_explained(alone)
 
     def _check_explained(self, last: Solution) -> float:
-        """Refuse a frame that no deflection explains; variance of one that may be moved: `estimators.frame_checks`."""
+        """Refuse a frame that no deflection explains; variance due to a possible motion: `estimators.frame_checks`."""
         design = self._design(last)
         shape = last.shape_found / self._shape_sd
         fault, variance = fault_of_fit(design, last.rms_px, shape, self.apriori.higher_lobes_rad)
@@ -563,7 +563,7 @@ class OrientedCamera:
         return bool(np.abs(moved).max() < REACH_PX) and design.speaks_against(moved)
 
     def _shows_most(self, rows: NDArray[np.intp]) -> bool:
-        """Whether the rows (n,) of features found are enough, and most of what the benchmark frame shows of theirs."""
+        """Whether the found feature rows (n,) are enough, and most of those of their kind in the benchmark frame."""
         return len(rows) > max(USUAL_SHARE * self._alike_at_benchmark(rows), LEAST_FEATURES)
 
     def _alike_at_benchmark(self, rows: NDArray[np.intp]) -> int:
@@ -571,7 +571,7 @@ class OrientedCamera:
         return self.features_at_benchmark(bool(len(rows)) and bool(rows[0] < self.painted_rows))
 
     def _check_seen(self, horizon: HorizonLine, last: Solution) -> None:
-        """Refuse a frame of which little is seen: what there is may agree by chance."""
+        """Refuse a frame in which little is found: so few points may agree by chance."""
         of_features = len(last.feature_rows) / max(self._alike_at_benchmark(last.feature_rows), 1)
         of_edge = self._edge_share(len(horizon.points_px))
         wanted = _EDGE_BESIDE if of_features < _HARDLY_FEATURES else _LITTLE_SEEN
@@ -583,7 +583,7 @@ class OrientedCamera:
             )
 
     def _check_sharp(self, frame: EditedFrame, horizon: HorizonLine) -> None:
-        """Refuse a frame whose edge is sharper or less sharp than the benchmark's: shades move a wide step's middle."""
+        """Refuse a frame whose edge is sharper or blurrier than the benchmark's: shading shifts wide steps."""
         steepness = steepness_of(frame.kept, horizon)
         # no comparison with NaN is true: of too few points nothing is said
         if min(steepness, self.steepness) < _AS_SHARP * max(steepness, self.steepness):
@@ -735,7 +735,7 @@ class OrientedCamera:
         return best[2]
 
     def _guesses(self, frame: EditedFrame, start: FloatArray) -> Iterator[tuple[FloatArray, tuple[int, ...]]]:
-        """Deformations (3,) near which the shell may be, the likeliest first; each is only made when asked for.
+        """Deformations (3,) to start from, likeliest first; computed lazily.
 
         With each, how far texture is looked for, first and then: where it need not be, shades are found that stay.
         """
@@ -846,7 +846,7 @@ class OrientedCamera:
         return None
 
     def _independent_edge(self, frame: EditedFrame, horizon: HorizonLine, deformation: FloatArray) -> HorizonLine:
-        """Edge that owes nothing to the features, ``deformation`` moved near it; `NoFitError` where there is none.
+        """Edge found independently of the features, ``deformation`` moved near it; `NoFitError` if there is none.
 
         What was found near the features' answer where that is an edge, not steps in the clouds; else found from far.
         """

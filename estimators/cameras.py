@@ -1,4 +1,4 @@
-"""What was the deflection, given the films of several cameras, used at once or switched? One history, one error bar.
+"""Deflection from the films of several cameras, simultaneous or switched: one history with one covariance.
 
 Every film is fitted by its own oriented camera (`estimators.camera`), relative to its own benchmark frame. One smooth
 process of the deflection is then fitted to all frames at once, each camera ``c`` with systematic errors of its own::
@@ -61,7 +61,7 @@ _ANY_OFFSET_RAD = float(np.deg2rad(20.0))  # sd of an offset about which nothing
 
 @dataclass(frozen=True)
 class CameraReadings:
-    """What one camera read.
+    """Readings of one camera.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
 
 
 def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReadings]:
-    """Cameras whose undetermined benchmark may be deflected by as much as cameras with earlier ones read about then.
+    """Cameras with the benchmark's a priori sd set from what cameras with earlier benchmarks read at that time.
 
     The a priori sd holds before the load; a camera that was switched on later has no such frame. The smallest of
     several readings counts: one camera that errs must not set the others free.
@@ -264,7 +264,7 @@ def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReading
 
 
 def best_clock(cameras: list[CameraReadings]) -> CameraReadings:
-    """Camera whose time is known best, in whose time tags the answer is; the first of those that are equal."""
+    """Reference camera: the one with the smallest time-bias sd, in whose time tags the answer is; first of equals."""
     return min(cameras, key=lambda one: one.read.time_bias_sd_s)
 
 
@@ -297,7 +297,7 @@ def _fitted(evidence: list[Evidence], at_s: FloatArray) -> Fused:
 
 
 def _timed(evidence: list[Evidence], fused: Fused) -> list[Evidence]:
-    """Readings at the times that the fit gave them, what is left of their time biases an input like any other."""
+    """Readings moved by the fitted time biases; the remaining time-bias errors are inputs like any other."""
     known = {name: value for name, value in fused.inputs.items() if name.startswith(CAMERA_TIME_BIAS)}
     out = []
     for one in evidence:
@@ -309,14 +309,14 @@ def _timed(evidence: list[Evidence], fused: Fused) -> list[Evidence]:
 
 
 def _pair_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
-    """Differences of every two cameras where both look; the motion between their frames is taken out first."""
+    """Differences of every two cameras in overlapping spans, corrected for the motion between their frames."""
     still = [replace(e, theta_yz_rad=e.theta_yz_rad - fused.deflection(e.time_s)) for e in _timed(evidence, fused)]
     pairs = agreement(still).pairs
     return [replace(pair, methods=tuple(m.removeprefix("camera ") for m in pair.methods)) for pair in pairs]
 
 
 def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
-    """How far each camera is off the others where it may be off by anything, over the sd that all errors leave.
+    """Offset of each camera, left free, from the others, over its sd from all errors.
 
     The process's size is then the motion's own: taken as motion, an offset at a switch would make it large enough to
     explain the step.
@@ -340,7 +340,7 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
 
 
 def _left_out(cameras: list[CameraReadings]) -> str | None:
-    """The one camera without which, and without which alone, the others agree; None where that cannot be determined."""
+    """The only camera whose exclusion makes the others agree; None if there is not exactly one."""
     if len(cameras) < 3:
         return None
     sound = []

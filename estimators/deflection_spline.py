@@ -1,4 +1,4 @@
-"""How are the deflection's spline and the inputs found together? Normal equations that stay a band.
+"""Joint least squares for the deflection's spline and the inputs, with banded normal equations.
 
 The deflection's lateral vector is a cubic spline with even knots, of which four basis functions differ from
 zero at a time: rows of the least-squares problem are sparse in its coefficients, and their normal matrix ``N`` is a
@@ -40,7 +40,7 @@ Inputs = dict[str, FloatArray]
 
 @dataclass(frozen=True)
 class InputPosterior:
-    """Posterior of all inputs: ``mean`` (k,) and ``covariance`` (k, k) of their unit normals, ``place`` of each."""
+    """Posterior of all inputs' unit normals: ``mean`` (k,), ``covariance`` (k, k), and ``place``, each one's slice."""
 
     mean: FloatArray
     covariance: FloatArray
@@ -86,7 +86,7 @@ class Spline:
         return csr_array((value.ravel(), column.ravel(), 4 * np.arange(len(value) + 1)), (len(value), self.count))
 
     def responses(self, time_s: FloatArray, by_order: Iterable[FloatArray]) -> csr_array:
-        """Rows (n c, 2 count) of what depends on the lateral vector, its rate and acceleration by (n, c, 2) each."""
+        """Rows (n c, 2 count) of readings with derivatives (n, c, 2) by lateral vector, rate and acceleration."""
         column, parts = self.at(time_s)[0], []
         for order, by in enumerate(by_order):
             parts.append(by[:, :, None, :] * self.at(time_s, order)[1][:, None, :, None])
@@ -96,7 +96,7 @@ class Spline:
         return csr_array((value.ravel(), column.ravel(), 8 * np.arange(count + 1)), (count, 2 * self.count))
 
     def smooth(self, time_s: FloatArray, values: FloatArray) -> FloatArray:
-        """Least-squares fit to values (n, c) at times (n,), there; the smallest one where samples are too few."""
+        """Least-squares fit at times (n,) to values (n, c); the minimum-norm one if samples are too few."""
         rows = self.rows(time_s)
         band = lower_band(csr_array(rows.T @ rows))
         band[0] += _WITHOUT_SAMPLES * band[0].max()
@@ -152,7 +152,7 @@ class Solution:
 
     @cached_property
     def own(self) -> csr_array:
-        """Covariance (2 m, 2 m) of the coefficients that act at one time, the inputs known; of no others."""
+        """Covariance (2 m, 2 m) of the coefficients given the inputs, only between those that overlap in time."""
         return self.factor.inverse_near_diagonal()
 
     @property

@@ -168,7 +168,7 @@ def fault_of_frame(picture: Image | KeptPicture, size_px: tuple[int, int]) -> Is
 
 
 def _fault_of_fields(one: FloatArray, two: FloatArray) -> Issue:
-    """Whether every other row is of another moment: then rows next to each other differ more than every other one.
+    """Check for interlacing: if fields have two times, adjacent rows differ more than every other row.
 
     In a picture of one moment the difference grows with the distance of the rows, and noise is in both alike. Fields
     whose edges lie less than a pixel or two apart pass: their mean is the edge at the mean of their times.
@@ -408,7 +408,7 @@ def fit_steps(grey, inside, noise, contrast, places, bases, place, along, left, 
 
 @inlined
 def square_of_model(left, good, noise, beside, square):
-    """Mean square (n,) of what step and ramp leave (n, m), of the mean over a line and ``beside`` on either side.
+    """Mean square (n,) of the residuals of step and ramp (n, m), averaged over ``beside`` lines on either side.
 
     Beyond noise; lines that are not good count nothing.
     """
@@ -433,7 +433,7 @@ def square_of_model(left, good, noise, beside, square):
 
 @kernel
 def good_steps(lines, steps, noise, weights, beside, floor, found):
-    """Move the points (n, 2) at good steps on lines, their directions, sd and indices to the front; their number.
+    """Move points (n, 2), directions, sd and indices of lines with good steps to the front; returns their number.
 
     ``lines``: origins, directions, indices. ``steps``: as of `fit_steps`. ``weights``: samples that err together, of
     noise and of what step and ramp leave; see `square_of_model`.
@@ -455,7 +455,7 @@ def good_steps(lines, steps, noise, weights, beside, floor, found):
 
 
 def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
-    """Find the edge where it is expected within a few pixels, darker or brighter than what lies behind it.
+    """Find the edge within a few pixels of its prediction, darker or brighter than its background.
 
     Parameters
     ----------
@@ -484,7 +484,7 @@ def steps_near(image: Image | KeptPicture, lines: ScanLines) -> HorizonLine:
 
 @kernel
 def mark_coherent(line, residual, beside, within, found):
-    """Mark residuals (n,) that more than ``beside`` of as many places on either side, and their own, lie ``within``.
+    """Mask of residuals (n,) supported by more than ``beside`` neighbours, itself included, within ``within`` px.
 
     ``line`` (n,): places, increasing.
     """
@@ -512,7 +512,7 @@ def is_coherent(line: NDArray[np.intp], residual_px: FloatArray) -> BoolArray:
 
 
 class KeptPicture:
-    """A picture, and what was made of it, for those who look at it again: how rows differ, smoothed grey levels.
+    """A picture with cached results for repeated use: row differences and smoothed grey levels.
 
     Parameters
     ----------
@@ -557,7 +557,7 @@ class KeptPicture:
 
 
 def kept_picture(image: Image | KeptPicture) -> KeptPicture:
-    """Return a picture with what was made of it."""
+    """Return a picture with its cached results."""
     return image if isinstance(image, KeptPicture) else KeptPicture(image)
 
 

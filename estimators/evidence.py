@@ -1,4 +1,4 @@
-"""What does one method read of the deflection, and which uncertain inputs does it depend on?
+"""Readings of the deflection by one method, and the uncertain inputs on which they depend.
 
 Every method reads the deflection with an error that is linear in named inputs, which several methods share (the flow's
 angle, coefficients, masses, the accelerometer's errors), and in the oscillation of the joint::
@@ -272,7 +272,7 @@ def held_balance(residual: Residual, loads: FlightLoads, start_yz_rad: FloatArra
 
 
 def _inverse(matrices: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Inverses of (n, 2, 2) and where they exist; identities elsewhere, as far from a solution."""
+    """Inverses of (n, 2, 2) and mask of those that exist; singular ones become the identity."""
     size = np.linalg.det(matrices)
     good: BoolArray = np.asarray(np.isfinite(size) & (np.abs(size) > _LEAST_DETERMINANT))
     return np.asarray(np.linalg.inv(np.where(good[:, None, None], matrices, np.eye(2)))), good
@@ -329,7 +329,7 @@ def evidence_of_balance(
 def swing_responses(
     left: Callable[[Swing], FloatArray], swing: Swing, base: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Derivatives (n, c, 2) of what is left of a balance (n, c) by the deflection, its rate and its acceleration."""
+    """Jacobian (n, c, 2) of the balance residual (n, c) with respect to deflection, rate and acceleration."""
     none = np.zeros(2)
 
     def by(step: float, moved: Callable[[FloatArray], Swing]) -> FloatArray:
@@ -466,7 +466,7 @@ def moved_evidence(one: Evidence, inputs: dict[str, FloatArray], about: Deflecti
 def history_of_evidence(
     evidence: Evidence, loads: FlightLoads, assumptions: str, seen: Evidence | None = None
 ) -> DeflectionHistory:
-    """History of a method by itself, sample by sample: NaN where it has no answer, or none with an uncertainty.
+    """Sample-by-sample history of a single method: NaN without an answer, or without an uncertainty.
 
     The terms of the joint's oscillation are bounded by the rms of the readings' own derivatives over
     `_OSCILLATION_WINDOW_S`; a reading without neighbours has no derivatives. ``seen`` are readings of the same samples
@@ -507,7 +507,7 @@ def _curved_quantiles(evidence: Evidence, swinging: FloatArray) -> FloatArray:
 
 
 def _oscillation_var(evidence: Evidence, seen: Evidence) -> FloatArray:
-    """Mean square (n,), rad^2 an axis, of a method's terms of the oscillation that readings of the samples show."""
+    """Mean square (n,), rad^2 per axis, of a method's rate and acceleration terms for the observed oscillation."""
     t, theta_yz = evidence.time_s, seen.theta_yz_rad
     if len(t) < 5:
         return np.zeros(len(t))

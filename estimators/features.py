@@ -278,7 +278,7 @@ def _drawn(view: VirtualCamera) -> ImageFeatures:
 
 
 def light_shift(view: VirtualCamera, features: Features) -> FloatArray:
-    """What the light's shift of features away from the shell's axis, px, does to each row (n, 3).
+    """Response (n, 3) of each row to a radial shift of features by the light, px.
 
     It is the same all round the shell, or cosine and sine of one wave.
     """
@@ -291,7 +291,7 @@ def light_shift(view: VirtualCamera, features: Features) -> FloatArray:
 
 
 def no_features() -> ImageFeatures:
-    """Of a shell that shows nothing: its edge alone is looked for."""
+    """No features, for a shell without any: only its edge is searched for."""
     nothing = np.zeros(0, dtype=np.int64)
     return ImageFeatures(np.zeros((0, 3)), np.zeros((0, 2)), nothing, nothing.astype(np.bool_), np.zeros(0))
 
@@ -460,7 +460,7 @@ def fit_feature_map(
 
 @dataclass(frozen=True)
 class _Map:
-    """How dark and how pale each pixel is against its surroundings, (2, h, w), and which of both each feature is."""
+    """Darkness and brightness of each pixel against its surroundings, (2, h, w), and which of both each feature has."""
 
     pictures: NDArray[np.float32]
     means: FloatArray

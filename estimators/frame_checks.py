@@ -1,4 +1,4 @@
-"""Does a deflection explain what was found in a frame, or would more have to have happened than it allows for?
+"""Does a deflection explain a frame's points, or is more motion needed than the model allows?
 
 Tested at the end of a frame's fit are the rms of its residuals, the shape and light that the fit needed against their a
 priori sd, two ways in which the picture may have moved since the benchmark frame (a turn of the camera in its mount
@@ -181,7 +181,7 @@ class Design:
         return self.columns[:, :2] * left[:, None], self.columns[:, :2] * upper[:, None]
 
     def speaks_against(self, moved_px: FloatArray) -> bool:
-        """Whether the points lie where they would without a motion of the picture, known from elsewhere, by (n,) px.
+        """Whether the points contradict a picture motion of (n,) px that is known from elsewhere.
 
         Both are tested by how much of that motion the residuals show: none, or all.
         """
@@ -275,5 +275,5 @@ def _fault_of_halves(design: Design) -> tuple[Issue, float]:
 
 
 def _beyond(square: float, usual: float) -> float:
-    """Share of a chi-square beyond what is usual."""
+    """Share of a chi-square in excess of its usual value."""
     return 1.0 - usual / max(square, usual)

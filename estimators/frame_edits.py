@@ -1,4 +1,4 @@
-"""What does an analyst's eye add to a frame: regions not to look at, points of the edge, places of features?
+"""An analyst's edits of a frame: masked regions, points of the edge, places of features.
 
 `EditedFrame` is a picture with the decisions about it (`flightmodel.camera_edits`); the fit looks for edge and features
 through it alone:
@@ -37,7 +37,7 @@ LEAST_MARKS = 5  # deflection (2), flattening and light leave less than that und
 
 @dataclass(frozen=True)
 class MarkedFeatures:
-    """Features that the camera finds, and behind them those that an analyst marked, two rows each.
+    """Features found by the camera, followed by those that an analyst marked, two rows each.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class MarkedFeatures:
 
 @dataclass(frozen=True)
 class EditedFrame:
-    """A picture, and what an analyst decided about it.
+    """A picture with an analyst's edits.
 
     Parameters
     ----------
@@ -199,5 +199,5 @@ def marked_on_shell(view: VirtualCamera, features_px: Mapping[str, FloatArray]) 
 
 
 def unedited(image: Image | EditedFrame) -> EditedFrame:
-    """A picture as a frame that nobody edited."""
+    """A picture without edits, as a frame."""
     return image if isinstance(image, EditedFrame) else EditedFrame(image)

@@ -1,4 +1,4 @@
-"""How far are the edge points and features found in a frame from where a deformed shell would show them?
+"""Differences of edge points and features found in a frame from their predictions for a deformed shell.
 
 Residuals are found minus predicted, with the prediction's derivatives by all that is fitted: the deformation, the
 camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell (with two waves
@@ -222,7 +222,7 @@ def turn_columns(columns, first, turned):
 
 @inlined
 def lower_products(columns, count, weight, first, weighted, product):
-    """Weighted products of points' columns, one a row (q, n), with those up to themselves, from the ``first`` row on.
+    """Lower triangle, from row ``first``, of the weighted products of the points' columns, stored as rows (q, n).
 
     ``weighted`` (n,): room for one. Sums along rows run in vector registers.
     """

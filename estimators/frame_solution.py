@@ -305,7 +305,7 @@ def _feature_residuals(
 
 @inlined
 def _without_shape(residual, rows, shape, form, left):
-    """Residuals less what joint, lobes and light of the step before explain: they are no scatter."""
+    """Residuals minus the effects of joint, lobes and light from the last step, which are not scatter."""
     for i in range(len(residual)):
         left[i] = residual[i] - rows[i, JOINT] * form[0]
         for j in range(SHAPES):
@@ -314,7 +314,7 @@ def _without_shape(residual, rows, shape, form, left):
 
 @inlined
 def _add_prior(prior, flattening, k, normal, right):
-    """Take the right side (n,) out of the last row, and add means and sd on all but ``k`` of a deflection."""
+    """Copy the right side (n,) from the last row, and add the priors of all parameters but the deflection (``k``)."""
     mean, sd = prior
     for a in range(len(right)):
         right[a] = normal[len(right), a]
@@ -438,7 +438,7 @@ def solved_step(columns, residual, weight, prior, flattening, formal, found):
 
 @kernel
 def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
-    """Move what belongs to points with a weight to the front; their number, and the weighted square of ``left``.
+    """Move points with non-zero weight to the front; returns their number and the weighted square of ``left``.
 
     ``columns`` (n, k + 17): derivatives by deflection, flattening, joint, lobes and light. ``of_used``: places of the
     points, their rows (n, 16), residuals and weights.

@@ -1,4 +1,4 @@
-"""What is the one answer of all methods of a flight, and do they agree?
+"""Combined answer of all methods of a flight, and whether they agree.
 
 Camera, misalignment and trim are fused into one posterior of the deflection and of their common inputs
 (`estimators.fusion`); every pair is tested and every input scored as a fault hypothesis (`estimators.agreement`); the
@@ -66,7 +66,7 @@ class CameraTimeBias:
 
     @property
     def cause(self) -> str:
-        """What to correct before anything else is suspected; empty where the bias is not off."""
+        """Cause to correct before any other is suspected; empty if the time bias is not significant."""
         return f"the film's time tags come first ({self.remark}), correct them in frames.csv" if self.is_off else ""
 
     @property
@@ -106,7 +106,7 @@ class FusedAnswer(Fused):
 
     @property
     def remark(self) -> str:
-        """Whether the methods agree, and what was made of it where they do not."""
+        """Whether the methods agree, and the measures taken if they do not."""
         bias = self.camera_time_bias
         words = self.agreement.explained("" if bias is None else bias.cause)
         if self.left_out is not None:
@@ -361,7 +361,7 @@ def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float)
 def _mixed(
     answer: FusedAnswer, histories: dict[str, DeflectionHistory], weights: FloatArray, loads: FlightLoads
 ) -> FusedAnswer:
-    """Answer whose history is the mixture of several, at its own times; their differences are in the covariance."""
+    """Answer with the mixture of several histories, at its own times; the covariance includes their differences."""
     t, own = answer.history.time_s, answer.history
     yz, cov, weight = [], [], []
     for history, one in zip(histories.values(), weights / weights.sum(), strict=True):

@@ -127,7 +127,7 @@ def whitened(one: Evidence, spline: Spline, place: dict[str, slice], inputs: Inp
 
 
 def span_numbers(time_s: FloatArray, width_s: float, from_s: float) -> NDArray[np.int64]:
-    """Number of the span in which each time (n,) lies, one of which begins at ``from_s``."""
+    """Index of the span that contains each time (n,); one span begins at ``from_s``."""
     return np.asarray(np.floor((time_s - from_s) / width_s + 1e-6).astype(np.int64))
 
 
@@ -307,7 +307,7 @@ def smoothed(
 
 
 def with_unresolved_swing(readings: DeflectionHistory, smooth: DeflectionHistory, swing_hz: float) -> DeflectionHistory:
-    """Smooth history of readings with the swing in its sd that they are too sparse to follow; as it is elsewhere."""
+    """Smooth history with the oscillation added to its sd where readings are too sparse to resolve it."""
     known = readings.time_s[np.isfinite(readings.theta_rad)]
     after = np.searchsorted(known, smooth.time_s).clip(1, len(known) - 1)
     sparse = (known[after] - known[after - 1]) * swing_hz * _READINGS_A_SWING > 1.0
@@ -345,7 +345,7 @@ def _unresolved_swing_var(readings: DeflectionHistory, at: DeflectionHistory, sw
 
 
 def _uncorrelated(one: Evidence) -> Evidence:
-    """Evidence with every sample's error independent of the others."""
+    """Evidence with independent errors of all samples."""
     return replace(one, by_input={}, independent_cov=one.covariance)
 
 
@@ -476,7 +476,7 @@ def _check_inputs(inputs: Inputs, input_posterior: InputPosterior, method: str) 
 
 
 def _without_holes(time_s: FloatArray) -> FloatArray:
-    """Times with others, as far apart as is usual, where some are missing."""
+    """Times with gaps filled at the usual spacing."""
     step = np.diff(time_s)
     missing = np.round(step / np.median(step)).astype(np.int64) - 1
     hole = np.flatnonzero(missing > 0)

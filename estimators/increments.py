@@ -123,7 +123,7 @@ class Processes:
         return np.array(out)
 
     def flown(self, table: AeroTable, increments: FloatArray) -> AeroTable:
-        """Table with the increments (4, k) at the knots, which become knots of its own."""
+        """Table with the increments (4, k) at the knots applied; the knots become breakpoints of the table."""
         mach = np.union1d(table.mach, np.exp(self.log_mach))
         c = table.at(mach[:, None], table.alpha_rad)
         d = self.at(mach, increments).T[:, None, :]
@@ -221,7 +221,7 @@ def _halfway(one: Deflection, other: Deflection) -> Deflection:
 
 
 def _instantaneous(reader: LoadsReader) -> LoadsReader:
-    """Reader of loads as they were at their times, not means over windows, to second order.
+    """Reader of instantaneous loads, not window means, to second order.
 
     A mean over a window is too large by half the second derivative times the window's variance: ``h^2 / 3`` of ``h`` to
     both sides, ``(2 h)^2 / 6`` of the difference of two means over ``2 h`` side by side. Of a vehicle that pitches and
@@ -267,7 +267,7 @@ class _Slopes:
     increments: FloatArray
 
     def along(self, by_input: Inputs, mach: FloatArray) -> Inputs:
-        """Responses (n, c, j) with those to coefficients (n, c, 1) per unit normal of their processes, (n, c, k)."""
+        """Responses (n, c, j), those to a coefficient (n, c, 1) expanded to its process's unit normals (n, c, k)."""
         weights, out = self.processes.weights(mach), dict(by_input)
         for k, name in enumerate(COEFFICIENTS):
             if name in by_input:

@@ -1,4 +1,4 @@
-"""What would the real camera have shown at the estimated deflection? Pictures for the eye (seed paper Figure 2.3).
+"""Simulated view of the real camera at the estimated deflection, for visual comparison (seed paper Figure 2.3).
 
 The virtual camera's view is drawn beside and over the filmed frame: the shell deflected as estimated, shaded by how it
 faces the camera, ``grey = 60 + 150 |n . v|``, with the mesh's lines on it; where the centerbody hides it, it is not

@@ -255,7 +255,7 @@ def mode_sd_rad(apriori: AprioriSd) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Stacked:
-    """What a film found of the shape (13 n,), its responses (13 n, 13), and covariances (13 n, 13 n) of its parts."""
+    """Shape readings of a film (13 n,), their responses (13 n, 13), and covariances (13 n, 13 n) of their parts."""
 
     found: FloatArray
     to_load: FloatArray
@@ -397,5 +397,5 @@ def _given_shape(
 
 
 def _share_found(formal: FloatArray, apriori: AprioriSd) -> FloatArray:
-    """``G``: what is found per unit of a true shape, of formal covariances (..., 13, 13)."""
+    """Gain ``G`` of the shape estimate on the true shape, from formal covariances (..., 13, 13)."""
     return np.eye(formal.shape[-1]) - formal * mode_sd_rad(apriori) ** -2.0

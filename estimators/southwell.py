@@ -45,7 +45,7 @@ _MOST_LOADS = 50.0  # the stiffness of a joint this many times stiffer than its 
 
 @dataclass(frozen=True)
 class Southwell:
-    """Line through one limb or the whole pulse.
+    """Line through the loading branch, the unloading branch or the whole pulse.
 
     Parameters
     ----------

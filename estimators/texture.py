@@ -1,4 +1,4 @@
-"""Where has the shell's own surface, whatever is painted on it, moved to in a frame?
+"""Tracking of the shell's own surface texture from the benchmark frame to other frames.
 
 Patches of the benchmark frame's picture are the templates. A pixel of the oriented camera looks at one point of the
 undeflected shell (sphere tracing against the tori), and a patch, small and on one torus, is a piece of the plane that
@@ -306,7 +306,7 @@ class PaintedTexture:
 
 
 def texture_of(view: VirtualCamera, benchmark: Image, cell_px: int = _CELL_PX) -> TrackedTexture:
-    """Patches of the shell in a benchmark frame that show something, spread over what is in view.
+    """Textured patches of the shell in a benchmark frame, spread over the part in view.
 
     Parameters
     ----------
@@ -351,7 +351,7 @@ def _patches(picture: NDArray[np.generic], pixels: NDArray[np.int64], axes: Floa
 
 
 def _across_shadow(patches: FloatArray) -> BoolArray:
-    """Whether patches (n, 15, 15) of grey lie across a shadow's edge; of none where so much of the shell is painted."""
+    """Mask of patches (n, 15, 15) across a shadow's edge; none if most patches are, as then the steps are painted."""
     along = np.maximum(patches.mean(axis=1), 1.0)
     steps = along.max(axis=1, initial=1.0) > _SHADOW * along.min(axis=1, initial=np.inf)
     return steps & (float(steps.mean() if len(steps) else 0.0) < _MOST)
@@ -367,7 +367,7 @@ def _ring_directions(view: VirtualCamera, points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Grid:
-    """What a grid of pixels (a, b) of a picture (h, w) looks at."""
+    """Shell points seen by a grid of pixels (a, b) of a picture (h, w)."""
 
     shape: tuple[int, int]
     steps: tuple[int, int]

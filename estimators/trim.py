@@ -65,7 +65,7 @@ _ASSUMPTIONS = (
 
 @dataclass(frozen=True)
 class TrimModel:
-    """What eqs. [5] and [6] need of a vehicle.
+    """Parameters of a vehicle in eqs. [5] and [6].
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ _MISREAD = 10  # one frame of so many may be
 
 
 def _check(over_sd: float, limit: float, good: str, bad: str) -> Check:
-    """Check of a deflection over its sd, with what was found and, where it fails, what to do."""
+    """Check of a deflection over its sd, with its remark and, on failure, advice."""
     passed, name = over_sd <= limit, "deflection without load over its sd"
     return Check("camera-rest", name, over_sd, 0.0, limit, passed, good if passed else bad, "camera")
 

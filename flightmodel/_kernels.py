@@ -79,7 +79,7 @@ def _temporary_folder(name: str, why: str) -> CacheFolder:
 
 
 def _writable(folder: Path) -> Path:
-    """Make a folder and put a file into it, or raise OSError: what exists may still be read-only."""
+    """Make a folder and test that a file can be written in it; OSError if not (an existing folder may be read-only)."""
     if folder.parts[0] == "~":
         raise FileNotFoundError(None, "this user has no home")
     folder.mkdir(parents=True, exist_ok=True)
@@ -129,12 +129,12 @@ def _kept(function, **options):
 
 
 def kernel(function):
-    """Compile with the project's settings: for what is called from Python only."""
+    """Compile a function that is called from Python only, with the project's settings."""
     return _kept(function, fastmath=FASTMATH)
 
 
 class _PartLibrary(JITCodeLibrary):
-    """A part's code as it was written, to be copied into its callers: optimised there, and machine code there alone."""
+    """Unoptimised code of a part; it is copied into its callers, and optimised and compiled to machine code there."""
 
     def _optimize_final_module(self):
         pass
@@ -161,7 +161,7 @@ class _Offering(AnalysisPass):
 
 
 class _PartCompiler(Compiler):
-    """numba's compiler as far as a part's callers need it: a third of the time that all kernels take is saved."""
+    """Numba's compiler reduced to the steps that a part's callers need: saves a third of all compile time."""
 
     def __init__(self, typing, target, _library, args, result, flags, local):
         flags.no_compile = True

@@ -166,7 +166,7 @@ class AeroTable:
 
 
 def check_axial_flow(path: Path, table: AeroTable) -> None:
-    """Raise `GateError` where the air flows along the axis and yet pushes sideways or turns the shell."""
+    """Raise `GateError` if normal force or pitching moment is not zero at zero angle of attack."""
     faults = [
         f"{path}: Mach {mach:g}, angle 0: {name} = {value:g}; {AXIAL_RULE}"
         for mach, row in zip(table.mach, table.coefficients[:, 0], strict=True)
@@ -192,7 +192,7 @@ def _row_faults(row: list[float], names: tuple[str, ...]) -> list[Issue]:
 
 
 def named_columns(wanted: tuple[str, ...], header: list[str]) -> dict[str, str]:
-    """Return which column of a header each of the ``wanted`` is, where one alone says it, however it is written."""
+    """Map each of the ``wanted`` columns to the one header name that matches it, however it is written."""
     words = {column: re.findall("[a-z]+", column.lower()) for column in header}
     found: dict[str, str] = {}
     for name in wanted:
@@ -236,7 +236,7 @@ def read_aero_table(path: Path, names: tuple[str, ...] = COLUMNS) -> AeroTable:
 
 
 def _columns(path: Path, names: tuple[str, ...], head: tuple[int, str]) -> list[str]:
-    """Columns of a table from its first line, number and text; `GateError` where wanted ones are not there once."""
+    """Find a table's columns in its first line; `GateError` if a wanted one is missing or repeated."""
     header = [cell.strip() for cell in head[1].split("#")[0].split(",")] if head[1] else []
     header = [c.lower() if c.lower() in names else c for c in header]
     missing = [c for c in names if c not in header]
@@ -511,7 +511,7 @@ class TableUncertainty(Section):
 
 
 class Sidecar(Section):
-    """What a coefficient table's numbers refer to, and where they come from."""
+    """Reference data and origin of a coefficient table."""
 
     source: Annotated[str, Field(min_length=1)]
     licence: Annotated[str, Field(min_length=1)]
@@ -530,7 +530,7 @@ class Knots(Section):
     value: tuple[Factor, ...]
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if not self.mach or len(self.mach) != len(self.value) or not _increase(self.mach):
             yield "", None, "as many values as Mach numbers, which increase, are wanted"
 
@@ -543,7 +543,7 @@ class DampingTable(Section):
     value: tuple[tuple[Coefficient, ...], ...]
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         sizes = {len(row) for row in self.value}
         if len(self.value) != len(self.mach) or sizes != {len(self.alpha_deg)}:
             yield "", None, "one row a Mach number and one value an angle are wanted"
@@ -564,7 +564,7 @@ class SphereCone(Section):
     cmq_table: DampingTable | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         widest = self.base_radius_m / float(np.cos(np.deg2rad(self.half_angle_deg)))
         if self.nose_radius_m >= widest:
             words = f"the nose cap is wider than the base; below {widest:.4g} m for this base and angle"
@@ -590,7 +590,7 @@ class Aerodynamics(Section):
     free_molecular: FreeMolecular | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         yield from one_of(self, "table", "sphere_cone")
 
 

@@ -84,7 +84,7 @@ def angle_partials(velocity_body_mps: FloatArray) -> FloatArray:
 
 
 def _or_nan(divisor: FloatArray) -> FloatArray:
-    """NaN where it is zero: of what stands still a direction is not known."""
+    """Copy with zeros replaced by NaN: the direction of a zero vector is undefined."""
     return np.where(divisor == 0.0, np.nan, divisor)
 
 

@@ -74,7 +74,7 @@ class Arrow:
 
     @property
     def dense(self) -> FloatArray:
-        """The same as a full matrix."""
+        """The matrix in dense form."""
         below = dia_array((self.band, -np.arange(len(self.band))), shape=(len(self.across),) * 2).toarray()
         return np.block([[below + np.tril(below, -1).T, self.across], [self.across.T, self.corner]])
 
@@ -145,7 +145,7 @@ class ArrowFactor:
         return own, -own[1:] @ gain
 
     def inverse_near_diagonal(self) -> csr_array:
-        """Covariance (n, n) of the band's unknowns, the border's known: what the band holds, and some beside it."""
+        """Covariance (n, n) of the band's unknowns given the border's: elements in the band, and some next to it."""
         own, below = self.inverse_blocks(max(len(self.band) - 1, 1))
         at, shape = np.arange(len(own) + 1), (len(own) * own.shape[1],) * 2
         lower = bsr_array((below, at[:-2], np.append(0, at[:-1])), shape=shape)

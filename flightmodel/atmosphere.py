@@ -106,7 +106,7 @@ _CO2_VIBRATIONS_K = 1.438777 * np.array([667.0, 667.0, 1333.0, 2349.0])  # of th
 
 @dataclass(frozen=True)
 class AirState:
-    """Air at given altitudes; all ``(...)`` arrays. ``density_sd`` is a fraction; winds are where the air goes."""
+    """Air at given altitudes, all arrays ``(...)``; ``density_sd`` is a fraction, wind the velocity of the air mass."""
 
     density_kgpm3: FloatArray
     temperature_k: FloatArray
@@ -197,7 +197,7 @@ def _sound_square_per_k(
 
 
 class StandardAir(NamedTuple):
-    """What is known at altitudes where air is looked up again and again: `us76`, and the sound's speed^2 per kelvin."""
+    """Standard air at altitudes that are looked up repeatedly: `us76`, and speed of sound squared per kelvin."""
 
     density_kgpm3: FloatArray
     temperature_k: FloatArray
@@ -206,7 +206,7 @@ class StandardAir(NamedTuple):
 
 
 def earths_standard_air(altitude_m: FloatArray) -> StandardAir:
-    """Return what `AtmosphereProfile.at` needs of the Earth's standard atmosphere at altitudes (n,), m."""
+    """Return the Earth's standard air at altitudes (n,), m, as `AtmosphereProfile.at` uses it."""
     density, temperature, pressure = us76(altitude_m)
     return StandardAir(density, temperature, pressure, _sound_square_per_k(altitude_m, temperature, WGS84))
 
@@ -326,7 +326,7 @@ def temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray
 
 
 def standard_temperature_sd(altitude_m: FloatArray, planet: Planet = WGS84) -> FloatArray:
-    """What a day's temperatures differ from the standard's, K (1 sd): 10 to 110 km, 30 from 120 km; of Mars as above.
+    """Sd of a day's temperature about the standard's, K: 10 to 110 km, 30 from 120 km; for Mars `temperature_sd`.
 
     Rms of NRLMSIS 2.1 less US76 between 30 and 60 deg of latitude, all seasons, hours and solar fluxes from 70 to 200:
     6 to 13 K up to 110 km, 29 K at 120 km.

@@ -239,7 +239,7 @@ class Camera:
         return np.asarray(turn @ self.dcm_cam_body)
 
     def sampled(self, samples: int) -> Camera:
-        """Return this camera with so many samples along each side of a pixel, those of one pixel about its middle."""
+        """Return this camera with each pixel divided into ``samples`` by ``samples``, centred on the pixel's middle."""
         return replace(
             self, width_px=samples * self.width_px, height_px=samples * self.height_px,
             focal_px=samples * self.focal_px, centre_px=samples * self.centre_px + 0.5 * (samples - 1),
@@ -297,7 +297,7 @@ def _five(distortion: FloatArray) -> FloatArray:
 
 
 def _slopes(distance: FloatArray, radial: list[int]) -> FloatArray:
-    """What unit coefficients (5,) add to a lens's slope, of which ``radial`` those of even powers of a distance are."""
+    """Derivative of a lens's slope by each coefficient (5,); ``radial``: indices of the coefficients of even powers."""
     out = np.zeros((5, len(distance)))
     for half_power, row in enumerate(radial, start=1):
         out[row] = (2 * half_power + 1) * distance ** (2 * half_power)

@@ -188,7 +188,7 @@ def read_edits(
 def faults_of(
     rows: list[Edit], time_s: FloatArray, size_px: tuple[int, int], lines: list[str] | None = None
 ) -> list[Issue]:
-    """Say what is wrong with edits of one camera; empty where they can be used."""
+    """List the faults of one camera's edits; empty if they can be used."""
     out = []
     for k, row in enumerate(rows):
         where = f"{lines[k]}: " if lines else f"{_LABEL}: edit {k + 1}: "

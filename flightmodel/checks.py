@@ -34,7 +34,7 @@ class Result(Protocol[T_co]):
 
 
 def part_of(report: Progress, first: float, last: float) -> Progress:
-    """Progress of a part of the work, from one fraction of it to another."""
+    """Progress callback of a subtask that covers the fractions ``first`` to ``last`` of the whole task."""
     return lambda fraction, what: report(first + (last - first) * fraction, what)
 
 

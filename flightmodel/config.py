@@ -74,7 +74,7 @@ KeyFault = tuple[str, object, str]
 
 
 class KeyFaults(ValueError):
-    """What keys of a table do not fit each other; `parse_section` makes a sentence of each `KeyFault`."""
+    """Inconsistencies between keys of a table; `parse_section` makes a message of each `KeyFault`."""
 
     def __init__(self, faults: list[KeyFault]) -> None:
         self.faults = tuple(faults)
@@ -108,7 +108,7 @@ class Section(BaseModel):
         return _numbers_of(value, str(info.field_name)) if wanted & {int, float} and str not in wanted else value
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what keys do not fit each other; each is sound by itself."""
+        """Yield inconsistencies between keys, each of which is valid by itself."""
         return ()
 
     @model_validator(mode="after")

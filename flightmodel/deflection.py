@@ -177,7 +177,7 @@ class DeflectionHistory(Tabular):
         return cov
 
     def largest(self, within_s: tuple[float, float] = (-np.inf, np.inf)) -> int:
-        """Number of the largest answer, of either sign, within a span of time; of all where there is none in it."""
+        """Index of the answer with the largest magnitude within a span of time; of all answers if the span has none."""
         inside = (self.time_s >= within_s[0]) & (self.time_s <= within_s[1]) & np.isfinite(self.theta_rad)
         size = np.where(inside, self.theta_rad, np.nan) if inside.any() else self.theta_rad
         return int(np.nanargmax(np.abs(size)))
@@ -241,7 +241,7 @@ _CLEAR_SD = 4.0  # of a cycle: a minimum lies so many sd below its neighbouring 
 
 
 def cycle_about(history: DeflectionHistory, at_s: float) -> tuple[float, float] | None:
-    """Times of the minima before and after a time, s: the cycle in which it lies; None where none stands out there.
+    """Times of the minima before and after a time, s: the oscillation cycle around it; None if no cycle is distinct.
 
     A minimum counts where the angle rises to both sides by `_CLEAR_SD` of its sd at ``at_s``.
     """
@@ -261,7 +261,7 @@ def cycle_about(history: DeflectionHistory, at_s: float) -> tuple[float, float] 
 
 
 def _clear_minima(values: FloatArray, rise: float) -> IntArray:
-    """Places of minima from which values (n,) rise that much to both sides before they are lower (prominence)."""
+    """Indices of minima with a prominence of at least that much among values (n,)."""
 
     def rises(k: int, side: FloatArray) -> bool:
         lower = np.flatnonzero(side < values[k])
@@ -310,7 +310,7 @@ def standard_normals(dimensions: Literal[2, 3]) -> FloatArray:
 
 
 def interpolation_error(known_s: FloatArray, values: FloatArray, time_s: float) -> float:
-    """What a straight line between values ``(n,)`` misses of a curve: of their second difference ``s (1 - s) / 2``.
+    """Error of linear interpolation between values ``(n,)``: their second difference times ``s (1 - s) / 2``.
 
     It is taken as large as the largest about ``time_s``: among few of them all may be small where values are no denser
     than the swings.
@@ -349,7 +349,7 @@ def polar_from_lateral(
 
 
 def drawn_together(rows: IntArray) -> Iterator[IntArray]:
-    """Some rows (k,) after the other, as many as draws are held of at once: of all they are a run's largest arrays."""
+    """Split rows into chunks (k,) that limit memory: the draws of all rows together would be a run's largest arrays."""
     for first in range(0, len(rows), _ROWS):
         yield rows[first : first + _ROWS]
 

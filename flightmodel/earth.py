@@ -63,7 +63,7 @@ _BEYOND = 4  # columns repeated across 0 deg of longitude, so that the spline cl
 
 
 class Planet(NamedTuple):
-    """What pulls and turns below a flight, and the gas around it; numbers alone, so that kernels take it as it is."""
+    """Gravity, rotation and gas of a planet; numbers only, so that kernels accept it unchanged."""
 
     gm_m3ps2: float
     j2: float

@@ -79,7 +79,7 @@ class StateEntry(Section):
         return f"{stem}_sd_{unit}"
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         wanted = self._values
         sds = tuple(map(self._sd_key, wanted))
         for key in type(self).model_fields:
@@ -189,7 +189,7 @@ class DragEntry(Section):
     mass_sd_percent: Percent = 0.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         for one, other in (("c_a", "table"), ("area_m2", "diameter_m")):
             if (getattr(self, one) is None) == (getattr(self, other) is None):
                 yield one, getattr(self, one), f"state {one} or {other}, one of the two"

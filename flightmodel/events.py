@@ -25,7 +25,7 @@ def find_peak(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
 
 
 def has_peak(values: FloatArray) -> bool:
-    """Whether the largest value lies inside, not at an end where the data begin or stop."""
+    """Whether the largest value lies inside the record, not at its first or last sample."""
     return 0 < int(np.argmax(values)) < len(values) - 1
 
 
@@ -89,7 +89,7 @@ def value_at(time_s: FloatArray, values: FloatArray, at_s: float) -> float:
 
 
 def descent_events(time_s: FloatArray, altitude_m: FloatArray, mach: FloatArray) -> list[tuple[str, float]]:
-    """Name and time of apogee, of 80 and 40 km and of Mach 3.5 and 1 on the way down, of those that lie inside."""
+    """Names and times of apogee, and of 80 km, 40 km, Mach 3.5 and Mach 1 in descent, for those within the record."""
     found: list[tuple[str, float | None]] = []
     if has_peak(altitude_m):
         found.append(("apogee", find_peak(time_s, altitude_m)[0]))

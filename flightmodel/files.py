@@ -73,7 +73,7 @@ def open_file(path: Path, most_bytes: int = TABLE_BYTES) -> BinaryIO:
 
 
 def file_bytes(path: Path, most_bytes: int = TABLE_BYTES) -> bytes:
-    """Content of a file as `open_file` opens it; one that grows while it is read, or states no size, has an end too."""
+    """Content of a file opened by `open_file`; reading is bounded even if the file grows or states no size."""
     with open_file(path, most_bytes) as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
@@ -93,7 +93,7 @@ def unfit(path: Path, most_bytes: int) -> Issue:
 
 
 def nothing_at(path: Path) -> Issue:
-    """Say that there is no such file, and what there is in its place."""
+    """Return a message that there is no such file, with the files in its folder."""
     folder = path.parent
     try:
         there = sorted(p.name for p in folder.iterdir() if p.is_file() and not p.name.startswith("."))
@@ -174,7 +174,7 @@ def partial_path(target: Path, kind: str = PARTIAL) -> Path:
 
 
 def abandoned(folder: Path, name: str | None = None, kind: str = PARTIAL) -> Iterator[Path]:
-    """Paths in a folder, of `partial_path` for any target or that ``name``, of which nobody will ever take care."""
+    """Paths left in a folder by processes that ended, from `partial_path` for any target or for the target ``name``."""
     for path in sorted(folder.glob(f".{kind}-*")):
         found = _NAME.fullmatch(path.name)
         if found is None or found["kind"] != kind or name not in (None, found["name"]):

@@ -128,7 +128,7 @@ class Frames:
         yield from map(self._given, film_frames(self.paths[0], [int(self.numbers[k]) for k in wanted]))
 
     def _given(self, picture: Image) -> Image:
-        """Reduce a picture of the size that the film's should have; others stay for whoever looks to refuse."""
+        """Reduce a picture of the film's expected size; others are returned unchanged, for the caller to refuse."""
         if self.filed_px is None or picture.shape[::-1] != self.filed_px:
             return picture
         return np.asarray(cv2.resize(picture, self.camera.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
@@ -159,7 +159,7 @@ class Frames:
 
 
 def working_camera(camera: CameraMount) -> CameraMount:
-    """Camera as whose pictures a film is read: itself, or a smaller one where it has more pixels a radian."""
+    """Camera to which a film's pictures are reduced: itself, or a smaller one if it has more pixels per radian."""
     most = max(camera.focal_px)
     if most <= _FINEST:
         return camera
@@ -242,7 +242,7 @@ def film_timing_fault(path: Path) -> Issue:
 
 
 def start_fault(path: Path) -> Issue:
-    """Say why a file is no film by its first bytes; empty where they are a film's."""
+    """Return why a file is not a film, judged by its first bytes; empty if it is one."""
     if fault := unfit(path, sys.maxsize):  # it is decoded frame by frame
         return fault
     if path.stat().st_size == 0:
@@ -256,7 +256,7 @@ def start_fault(path: Path) -> Issue:
 
 
 def film_fault(path: Path, size_px: tuple[int, int], last_number: int) -> str:
-    """Say why a film of a camera with pictures of a size cannot be used; empty when it can."""
+    """Return why a film cannot be used by a camera of a picture size; empty if it can."""
     if fault := start_fault(path):
         return fault
     film = cv2.VideoCapture(str(path))
@@ -310,7 +310,7 @@ def _is_whole_png(path: Path) -> bool:
 
 
 def burnt_in(pictures: Sequence[NDArray[np.uint8]]) -> BoolArray | None:
-    """Pixels (h, w) of text, and of what else is fixed in the picture; None where none is found.
+    """Mask (h, w) of burnt-in text and other pixels that are fixed in the picture; None if there are none.
 
     Parameters
     ----------
@@ -331,7 +331,7 @@ def burnt_in(pictures: Sequence[NDArray[np.uint8]]) -> BoolArray | None:
 
 
 def _dead_lines(swing: NDArray[np.int16]) -> BoolArray:
-    """Rows and columns (h, w) that keep their grey levels, where what is around them does not, with what is beside."""
+    """Mask (h, w) of rows and columns that stay constant while their surroundings change, with their neighbours."""
     out = np.zeros(swing.shape, dtype=np.bool_)
     brush = np.ones(2 * _LINE_BESIDE_PX + 1)
     for along, across in ((0, 1), (1, 0)):
@@ -353,7 +353,7 @@ def _slope(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _groups(steady: BoolArray) -> BoolArray:
-    """Steady pixels (h, w) near each other, with what lies between them, and lines of text with what may follow."""
+    """Mask (h, w) of groups of nearby steady pixels with the gaps between them; lines of text are extended sideways."""
     brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _JOINED_PX + 1,) * 2)
     near = cv2.dilate(steady.astype(np.uint8), brush)
     count, label, boxes, _ = cv2.connectedComponentsWithStats(near)

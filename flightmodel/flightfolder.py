@@ -134,7 +134,7 @@ class AttitudeEntry(Section):
         return value
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         pointing = (self.azimuth_deg, self.elevation_deg, self.roll_deg)
         place = (self.latitude_deg, self.longitude_deg)
         if self.q_ecef_body is not None and any(v is not None for v in (*pointing, *place)):
@@ -155,7 +155,7 @@ class StartEntry(Section):
     state: StateEntry | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if self.at_rest is not None and not self.at_rest[0] < self.at_rest[1]:
             yield "at_rest", list(self.at_rest), "a rest ends after it begins: [from, to], s"
         if self.at_rest is None and self.azimuth_deg is not None:
@@ -185,7 +185,7 @@ class UnmodelledEntry(Section):
     sd_degps: Annotated[float, Field(ge=0.0, le=1e4)] = 0.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if not self.from_s < self.to_s:
             yield "to_s", self.to_s, f"a span ends after it begins; it begins at {self.from_s:g} s"
         if self.sd_mps2 == 0.0 and self.sd_degps == 0.0:
@@ -287,7 +287,7 @@ class FlightFile(Section):
 
     @property
     def measures_deceleration(self) -> bool:
-        """Whether the accelerometer measures ballistic flight's deceleration; else gyros go with it, or it is idle."""
+        """Whether the accelerometer measures the deceleration of ballistic flight; else it needs gyros, or is idle."""
         alone = self.sensors.rates is None or "trim_sd_deg" in self.motion.model_fields_set
         return self.motion.model == "ballistic" and self.sensors.accelerometer is not None and alone
 
@@ -312,7 +312,7 @@ class FlightFile(Section):
         return [*single, *self.films.values(), *self.radars.values(), *self.gnss.values(), *self.barometers.values()]
 
     def misfits(self, needs_path: bool = True) -> Iterator[Issue]:
-        """Yield what does not go together, each with what to write instead.
+        """Yield inconsistencies between tables, each with what to write instead.
 
         Without ``needs_path`` a folder with a film and neither radar nor receiver is whole, and one with loads always.
         """
@@ -343,7 +343,7 @@ class FlightFile(Section):
             yield Issue(words, "given-twice")
 
     def _misfits_of_planet(self) -> Iterator[Issue]:
-        """Yield what is known of the Earth alone."""
+        """Yield entries that need models available for the Earth only."""
         if self.body == WGS84:
             return
         where = f'planet = "{self.planet}"'
@@ -380,7 +380,7 @@ class FlightFile(Section):
             yield Issue(f"sensors.accelerometer.{words}", "inertial-missing")
 
     def _misfits_of_path(self) -> Iterator[Issue]:
-        """Yield what keeps a path from being found."""
+        """Yield missing inputs without which no trajectory can be estimated."""
         yield from self._misfits_of_drag()
         triads = [name for name in ("accelerometer", "rates") if getattr(self.sensors, name) is not None]
         if not self.radars and not self.gnss and self.start.state is None:
@@ -559,7 +559,7 @@ def read_flight(folder: Path, progress: Callable[[float], None] | None = None, n
 
 
 def _share_of(folder: Path, spec: FlightFile, progress: Callable[[float], None]) -> Callable[[int], None]:
-    """Turn bytes that were read more into the part of all tables' bytes."""
+    """Convert newly read bytes to a fraction of the bytes of all tables."""
     paths = [folder / source.file for source in spec.sources]
     total, done = sum(path.stat().st_size for path in paths if path.is_file()), 0
 
@@ -768,7 +768,7 @@ def _motion(spec: FlightFile, drag: StatedDrag | None) -> Motion:
 def assumed_errors(
     spec: FlightFile, radars: dict[str, RadarRecord], gnss: dict[str, GnssRecord]
 ) -> dict[str, dict[str, float]]:
-    """Standard deviations that flight.toml does not state and that are taken from the defaults, by table and key.
+    """Standard deviations that are taken from the defaults because flight.toml does not state them, by table and key.
 
     Errors whose default is none at all are left out, and those that the table does not measure.
     """
@@ -799,7 +799,7 @@ def assumed_of(entry: Section, known: Iterable[str] = ()) -> dict[str, float]:
 
 
 def _not_in_the_fixes(record: GnssRecord) -> set[str]:
-    """Keys of what a receiver does not measure, or whose noise it states in each fix."""
+    """Keys that do not apply to a receiver: quantities not measured, or noise that is given with each fix."""
     noises = [q.canonical for q in GNSS_SD]
     out = set()
     for read, keys in ((record.position_ecef_m, noises[:2]), (record.velocity_ecef_mps, noises[2:])):

@@ -214,7 +214,7 @@ class Gate:
         return time_s, values, frame.attrs["lines"]
 
     def chosen(self, table: Table, source: Source) -> Table:
-        """Return the rows that flight.toml lets be used, at its times, with a finding for those that it does not."""
+        """Return the rows within the spans that flight.toml allows, with a finding for those excluded."""
         if table.time_s is None:
             return table
         time_s = table.time_s + source.time.offset_s
@@ -230,7 +230,7 @@ class Gate:
         return table.of_rows(rows)
 
     def _ordered(self, table: Table) -> Table:
-        """Rows in the order of time, each once; what was done to them becomes findings, or a fault."""
+        """Rows in order of time without repeats; repairs become findings, or a fault."""
         if table.time_s is None:
             return table
         delivery = in_order(table.time_s, list(table.columns.values()), table.lines)
@@ -379,7 +379,7 @@ NAMED = 5  # times that a finding names one by one
 
 @dataclass(frozen=True)
 class Delivery:
-    """What becomes of a table's rows.
+    """Decision on a table's rows: rows used, repairs, refusal.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def _of_one_time(time_s: FloatArray, values: list[FloatArray]) -> tuple[IntArray
 
 
 def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArray:
-    """Late rows between two rows that came before them and stand at their usual interval."""
+    """Late rows that fall between two earlier rows at their usual spacing, so that no row was missing there."""
     if not len(late):
         return late
     times = time_s[kept]
@@ -459,7 +459,7 @@ def _without_room(time_s: FloatArray, kept: IntArray, late: IntArray) -> IntArra
 
 
 def _usual_step(times: FloatArray) -> float:
-    """Median step between rows that follow each other; infinite where there are none."""
+    """Median step between consecutive rows; infinite if there are none."""
     steps = np.diff(times)
     # in what was shuffled row by row the steps as delivered say nothing
     steps = np.diff(np.sort(times)) if (steps < 0.0).sum() > 0.25 * len(steps) else steps[steps > 0.0]
@@ -467,7 +467,7 @@ def _usual_step(times: FloatArray) -> float:
 
 
 def _set_back(time_s: FloatArray, usual: float, contradicting: IntArray) -> int | None:
-    """Row at which time steps back onto rows that it contradicts, and from which it runs on beyond them; or None."""
+    """Row at which the clock is set back: time steps back onto conflicting rows and then runs beyond them; or None."""
     top = np.maximum.accumulate(time_s)
     old = np.append(False, time_s[1:] <= top[:-1])
     doubtful = np.isin(np.arange(len(time_s)), contradicting)
@@ -527,7 +527,7 @@ def _refusal(time_s: FloatArray, lines: IntArray, again: IntArray, torn: IntArra
 
 
 def _blocks(rows: IntArray) -> str:
-    """How many rows in how many unbroken blocks of the file."""
+    """Phrase with the number of rows and of the file's unbroken blocks that they form."""
     if not len(rows):
         return ""
     inside = np.zeros(int(rows[-1]) + 1, dtype=bool)
@@ -566,7 +566,7 @@ def rows_to_use(label: str, source: Source, time_s: FloatArray) -> tuple[BoolArr
 def oversampled(
     name: str, time_s: FloatArray, thinning: tuple[ThinnedSpan, ...], components: tuple[str, ...]
 ) -> list[Issue]:
-    """Say how many of a tracker's rows only check the trajectory, of which components."""
+    """Findings that count a tracker's rows that are predicted and not used, by component."""
     idle = {c: int((~spaced(time_s, spacing_s(thinning, time_s, c))).sum()) for c in components}
     if not any(idle.values()):
         return []

@@ -109,7 +109,7 @@ class ShellGeometry(Section):
 
     @property
     def mesh(self) -> BodyMesh | None:
-        """The user's mesh of the aeroshell, whose edge and surface the camera then sees; None where there is none."""
+        """The user's mesh of the aeroshell, which then defines edge and surface for the camera; None without one."""
         return self._mesh
 
     def with_mesh(self, mesh: BodyMesh) -> ShellGeometry:
@@ -119,7 +119,7 @@ class ShellGeometry(Section):
         return shell
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         angle, base = np.deg2rad(self.half_angle_deg), self.base_radius_m
         outermost = self.innermost_torus_radius_m + (self.torus_count - 1) * self.torus_spacing_m * np.sin(angle)
         if self.nose_radius_m * np.cos(angle) >= base:
@@ -351,7 +351,7 @@ class MeshFile(Section):
     nose: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if Path(self.file).suffix.lower() not in KINDS:
             yield "file", self.file, f"a mesh ends in {', '.join(KINDS)}"
         if self.zero_clock is not None and self.zero_clock[-1] == self.forward[-1]:
@@ -532,13 +532,13 @@ def _fault_of_stl(data: bytes) -> str:
 
 
 def _fault_of_obj(data: bytes) -> str:
-    """Say why an OBJ file is not to be decoded."""
+    """Return why an OBJ file is refused."""
     corners = [len(line.split()) - 1 for line in data.splitlines() if line.lstrip()[:2] == b"f "]
     return _too_many(sum(max(n - 2, 0) for n in corners)) if corners else EMPTY
 
 
 def _fault_of_glb(data: bytes) -> str:
-    """Say why a GLB file is not to be decoded: cut off, referring elsewhere, packed, or larger than it looks."""
+    """Return why a GLB file is refused: truncated, with external references, compressed, or larger than it looks."""
     if data[:4] != b"glTF" or len(data) < 20:
         return "is no GLB file, or cut off: it does not begin with glTF and a head of 20 bytes"
     stated, size = (int.from_bytes(data[k : k + 4], "little") for k in (8, 12))
@@ -639,7 +639,7 @@ class Rim:
 
 
 def rim_circle(points_m: FloatArray) -> Rim:
-    """Circle through the outline from ahead, a convex hull, of points ``(n, 3)`` in body axes, m; Kasa's fit."""
+    """Circle fitted (Kasa) to the convex outline, seen from ahead, of points ``(n, 3)`` in body axes, m."""
     from scipy.spatial import ConvexHull
 
     hull = points_m[ConvexHull(points_m[:, 1:], qhull_options="QJ").vertices]

@@ -1,4 +1,4 @@
-"""Findings on what goes into a reconstruction and may make it confidently wrong, though nothing of it is refused.
+"""Findings on inputs that are accepted but may make a reconstruction confidently wrong.
 
 A receiver's filter follows the accelerations that its data sheet names, 4 g for those without a military or space
 licence. Beyond, its fixes lag or are extrapolated, while the satellites that it counts and the accuracy that it states
@@ -46,7 +46,7 @@ def input_findings(
 
 
 def _beyond_receiver(name: str, fixes: GnssRecord, force: TriadRecord, most_g: float) -> list[Issue]:
-    """Say which fixes were taken at more than a receiver can follow."""
+    """Findings on fixes taken at speeds or accelerations beyond the receiver's limits."""
     mean_g = _mean_before(fixes.time_s, force) / STANDARD_GRAVITY_MPS2
     doubtful = np.flatnonzero(mean_g > most_g)
     if not len(doubtful):

@@ -1,4 +1,4 @@
-"""What of an instrument do the flight file, the filter and the simulator have to agree on?
+"""Properties of instruments on which flight file, filter and simulator must agree: errors, mounting, keys.
 
 Each instrument is one record in SI: where it sits, and one row an error. A row (`ErrorRow`) states the error's prior in
 flight.toml, the error states it becomes in the filter, and the sizes from which the simulator draws it. From the rows
@@ -275,7 +275,7 @@ class TriadSpec(InstrumentSpec):
 
 
 def _triad_table(unit: str, state_unit: str, to_si: float, without: tuple[str, ...], **changed: Any) -> InstrumentTable:
-    """Rows of a triad whose signal stands in files in ``unit``; ``changed`` are its own defaults and the like."""
+    """Rows of a triad whose signal is in ``unit`` in files; ``changed``: fields of rows that differ for this triad."""
     rows = []
     for row in table_of(TriadSpec).rows:
         if row.name in without:
@@ -579,7 +579,7 @@ class Mounted(Source):
     position_from_datum_body_m: tuple[Place, Place, Place] | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if self.axes is not None:
             if self.mount is not None:
                 yield "axes", list(self.axes), f"mount = '{self.mount}' states the same; keep one of the two"
@@ -651,7 +651,7 @@ class TrackingSource(Source):
         return ("height",)
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         named = {c for span in self.every_s for c in span.components}
         words = f"is not among what is measured here: {', '.join(self.components)}"
         for component in sorted(named - {*self.components}):
@@ -685,14 +685,14 @@ class RadarEntry(TrackingSource):
         return self.measures
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         yield from super().key_faults()
         yield from servo_faults("servo_lag_sd", getattr(self, "servo_lag_sd", 0.0), self.angle_servo_hz)
 
 
 @with_keys(SITES.file_keys())
 class SitesEntry(Section):
-    """What the survey of all radar sites shares."""
+    """Survey errors common to all radar sites."""
 
 
 class Heights(TrackingSource):
@@ -706,7 +706,7 @@ class Heights(TrackingSource):
     ground_height_m: Annotated[float, Field(ge=-1000.0, le=9000.0)] | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         yield from super().key_faults()
         if self.height_is != "msl" and self.geoid_undulation_m is not None:
             words = 'is used only with height_is = "msl"; say that, or remove it'
@@ -716,7 +716,7 @@ class Heights(TrackingSource):
             yield "ground_height_m", self.ground_height_m, words
 
     def to_ellipsoid_m(self, latitude_rad: FloatArray | float, longitude_rad: FloatArray | float) -> FloatArray:
-        """What is added to heights of the table at places (...,), m: the ground's, the stated geoid's, or EGM96's."""
+        """Offset, m, from the table's heights to ellipsoidal ones at places (...,): ground, stated geoid, or EGM96."""
         if self.height_is == "ground":
             return np.full(np.shape(latitude_rad), self.ground_height_m)
         if self.height_is != "msl":
@@ -763,7 +763,7 @@ class AtmosphereEntry(Source):
     """The day's sounding; standard deviations default to those of rocketsondes and balloons."""
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if self.use_s is not None:
             yield "use_s", [list(span) for span in self.use_s], "a sounding is by altitude, not by time"
 

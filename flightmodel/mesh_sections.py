@@ -74,7 +74,7 @@ def meridian_sections(
 
 
 def _cut(off: FloatArray, place: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Both ends (q, 2, 2) of the cut through triangles whose corners lie ``off (q, 3)`` a plane, and where it is."""
+    """Ends (q, 2, 2) of the cuts of triangles by a plane, corners at distances ``off (q, 3)``, and which are cut."""
     above = off > 0.0
     # the corner that is alone on its side; the others are on the other
     alone = np.argmax(above == (above.sum(axis=1) == 1)[:, None], axis=1)

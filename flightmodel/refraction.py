@@ -1,4 +1,4 @@
-"""How the air bends and delays a radar's beam: what a radar reads of a point whose true place is known.
+"""Atmospheric refraction and delay of a radar's beam: readings of a point at a known position.
 
 Refractivity ``N = (n - 1) 1e6`` falls with height in spherical layers about the site's osculating sphere. Along a ray
 ``n r cos(elevation)`` is constant (Bouguer), so the angle at the Earth's centre and the electrical length are

@@ -192,7 +192,7 @@ def _new_fixes(values: FloatArray) -> BoolArray:
 
 
 def _held(name: str, time_s: FloatArray, new: BoolArray) -> Issue:
-    """Say that a log writes the receiver's last fix until the next: it is one measurement, of its first row's time."""
+    """Finding on a log that repeats the receiver's last fix: it counts once, at the time of its first row."""
     first = np.flatnonzero(new)
     held = time_s[np.append(first[1:], len(new)) - 1] - time_s[first]
     k = int(np.argmax(held))
@@ -204,7 +204,7 @@ def _held(name: str, time_s: FloatArray, new: BoolArray) -> Issue:
 
 
 def _positions(gate: Gate, table: Table, source: GnssEntry, planet: earth.Planet) -> FloatArray | None:
-    """ECEF positions (n, 3), m, from whichever columns are there; those that flight.toml declares go first."""
+    """ECEF positions (n, 3), m, from the available columns; those declared in flight.toml take precedence."""
     whole = {form: set(form) <= set(table.columns) for form in (ECEF, GEODETIC)}
     stated = [form for form in (ECEF, GEODETIC) if set(form) & set(source.columns)]
     if len(stated) == 2:
@@ -585,7 +585,7 @@ def _image_paths(
 def _film_numbers(
     gate: Gate, film: Path, table: pd.DataFrame, used: BoolArray, path: Path, camera: CameraMount, label: str
 ) -> IntArray:
-    """Number of every frame in the film; what is wrong becomes a fault."""
+    """Frame number in the film of every frame; problems become faults."""
     text = table["frame"].astype(str).str.strip()
     whole = text.str.fullmatch(r"\d{1,9}").to_numpy(dtype=bool)
     for row in np.flatnonzero(used & ~whole)[:5].tolist():
@@ -658,7 +658,7 @@ def with_least_count(record: TriadRecord) -> tuple[TriadRecord, list[Issue]]:
 
 
 def _least_count(column: FloatArray) -> float:
-    """Step of which nearly all differences of readings (n,) are whole multiples; 0 where there is none."""
+    """Least count: the step that divides nearly all differences of readings (n,); 0 if there is none."""
     known = column[np.isfinite(column)]
     known = known[np.abs(known) <= np.median(np.abs(known))] if len(known) else known  # a short pulse repeats none
     levels = np.unique(known)
@@ -728,7 +728,7 @@ def _winds(gate: Gate, table: Table, planet: earth.Planet) -> tuple[FloatArray, 
 
 
 def hydrostatic_error(altitude_m: FloatArray, pressure_pa: FloatArray, temperature_k: FloatArray) -> float:
-    """How much too high temperatures read for the fall of the pressure ``rho R T`` with height, as a fraction.
+    """Fractional excess of temperatures over those hydrostatically consistent with the pressure ``rho R T``.
 
     By ``d ln p / dh = -g / (R T)`` over each scale height below `BALLOON_TOP_M`: the largest; zero without a whole one.
     """

@@ -1,4 +1,4 @@
-"""What modified Newtonian flow does to a sphere-cone at any total angle of attack.
+"""Aerodynamic coefficients of a sphere-cone in modified Newtonian flow at any total angle of attack.
 
 ``Cp = Cp_max (n . v)^2`` on the windward side, zero in shadow. Up to the cone's half-angle nothing is in shadow and
 the coefficients are closed forms (see `sphere_cone_closed_form`); beyond it, and up to flow from behind on the flat
@@ -141,7 +141,7 @@ def bridge(knudsen_number: FloatArray | float) -> FloatArray:
 
 
 def wall_speed_ratio(wall_temperature_k: float, speed_mps: float) -> float:
-    """Thermal speed of what the wall sends back over the flight speed, ``sqrt(2 R T_w) / V``."""
+    """Ratio of the thermal speed of molecules re-emitted by the wall to the flight speed, ``sqrt(2 R T_w) / V``."""
     return float(np.sqrt(2.0 * R_AIR_JPKGK * wall_temperature_k) / speed_mps)
 
 

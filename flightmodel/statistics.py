@@ -29,7 +29,7 @@ BAND_COLUMNS = tuple(f"p{p:g}" for p in BAND_PERCENTILES)
 
 
 def chi_square_quantile(probability: float, degrees: float) -> float:
-    """Value below which a chi-square number of ``degrees`` stays; `scipy.stats`, which has it, takes long to load."""
+    """Quantile of the chi-square distribution with ``degrees``; avoids the slow import of `scipy.stats`."""
     return float(2.0 * gammaincinv(0.5 * degrees, probability))
 
 

@@ -84,7 +84,7 @@ class TimeEntry(Section):
     repeats: Literal["refuse", "first"] = "refuse"
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if (self.format == "utc_hms") != (self.columns is not None):
             yield "", None, 'format = "utc_hms" and columns = ["hour", "minute", "second"] belong together'
 
@@ -195,7 +195,7 @@ class TimeColumn:
     repeats: str = "refuse"
 
     def __post_init__(self) -> None:
-        """One column holds it unless more are named."""
+        """Use the one column unless several are named."""
         if not self.parts:
             object.__setattr__(self, "parts", (self.column,))
 
@@ -331,7 +331,7 @@ def place(quantity: Quantity, declared: Declared | None) -> tuple[str, str]:
 
 
 def fits(quantity: Quantity, unit: str) -> bool:
-    """Whether a quantity can have a unit."""
+    """Whether a unit is valid for a quantity."""
     found = read_unit(unit)
     return found is not None and found.kind == quantity.kind
 
@@ -505,12 +505,12 @@ class ThinnedSpan(Section):
     components: tuple[Component, ...] = ()
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if self.from_s is not None and self.to_s is not None and self.to_s <= self.from_s:
             yield "to_s", self.to_s, f"is not after from_s = {self.from_s:g}; swap the two"
 
     def holds(self, time_s: FloatArray, component: str) -> BoolArray:
-        """Which rows (n,) of a component it is about."""
+        """Mask of rows (n,) of a component to which the span applies."""
         inside: BoolArray = np.full(len(time_s), not self.components or component in self.components)
         if self.from_s is not None:
             inside &= time_s >= self.from_s

@@ -21,7 +21,7 @@ class Tabular:
         raise NotImplementedError
 
     def _about(self) -> str:
-        """One line: what it is of, how much, when."""
+        """One line: the content, its size and its time span."""
         return f"{len(self.to_frame())} rows"
 
     def __repr__(self) -> str:

@@ -81,7 +81,7 @@ class TriadRecord(SensorRecord):
 
 @dataclass(frozen=True)
 class SunRecord(SensorRecord):
-    """What Sun heads saw.
+    """Readings of Sun heads.
 
     Parameters
     ----------
@@ -320,7 +320,7 @@ class UnmodelledSpan:
 
 @dataclass(frozen=True)
 class Motion:
-    """How the vehicle moves, as far as it is stated rather than measured.
+    """Stated, not measured, properties of the vehicle's motion.
 
     Parameters
     ----------
@@ -487,7 +487,7 @@ def mean_readings(record: TriadRecord, span_s: tuple[float, float]) -> RestReadi
 
 
 def find_rest(force: TriadRecord, rate: TriadRecord) -> tuple[float, float] | None:
-    """Span in which the data begin at rest, a block less at its end; None without one of `LEAST_REST_S`."""
+    """Span at rest at the start of the data, minus one block at its end; None if shorter than `LEAST_REST_S`."""
     start_s = max(force.time_s[0], rate.time_s[0])
     end_s = min(force.time_s[-1], rate.time_s[-1])
     still: list[tuple[RestReadings, RestReadings]] = []

@@ -100,7 +100,7 @@ class MassProperties(Section):
 
 
 class MassStep(Section):
-    """Mass properties from a time of flight, or an event of that name, until the next: of the bodies that it states."""
+    """Mass properties of the stated bodies from a time of flight, or a named event, until the next step."""
 
     from_s: Time | None = None
     event: Label | None = None
@@ -108,7 +108,7 @@ class MassStep(Section):
     centerbody: MassProperties | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         yield from one_of(self, "from_s", "event")
         if self.aeroshell is None and self.centerbody is None:
             yield "", None, "the body that changes is wanted: aeroshell, centerbody or both"
@@ -141,7 +141,7 @@ class CompliantJoint(Section):
     creep_time_s: Annotated[float, Field(ge=0.1, le=1e4)] = 10.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if self.creep_share > 0.0 and self.bending_stiffness_nmprad == 0.0:
             yield "creep_share", self.creep_share, "a joint without bending stiffness has none; 0"
         least = -np.sqrt(3.0 * self.bending_stiffness_nmprad * self.hardening_nmprad3)
@@ -158,7 +158,7 @@ class CompliantJoint(Section):
 
     @property
     def held_stiffness_nmprad(self) -> float:
-        """Bending stiffness against a load that stays, N m/rad; without creep that against any."""
+        """Bending stiffness under a sustained load, N m/rad; without creep, under any load."""
         return self.bending_stiffness_nmprad * (1.0 - self.creep_share)
 
 
@@ -220,7 +220,7 @@ class AeroTerms(Section):
     roll_clock_lv_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         if (self.roll_order == 0) != (self.roll_share == 0.0):
             yield "", None, "roll_order (1 or more) and roll_share are wanted together"
 
@@ -315,7 +315,7 @@ class CameraMount(Section):
         )
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         count, lens = len(self.distortion), self.lens
         wanted = "k1, k2, k3, k4" if lens == "fisheye" else "k1, k2, p1, p2 or k1, k2, p1, p2, k3"
         if count != 4 and not (lens == "pinhole" and count == 5):
@@ -342,7 +342,7 @@ class VehicleFile(Section):
     cameras: dict[Name, CameraMount] = {}
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield what does not go together."""
+        """Yield inconsistencies between keys."""
         cone, shell = self.aerodynamics.sphere_cone, self.geometry
         for key in ("half_angle_deg", "nose_radius_m", "base_radius_m") if cone is not None else ():
             flown, drawn = getattr(cone, key), getattr(shell, key)

@@ -127,7 +127,7 @@ class Drag:
     ca_shape_sd: float
 
     def rows(self, keep: BoolArray) -> Drag:
-        """Of chosen samples."""
+        """Force model of chosen samples."""
         per_mass = self.area_per_mass_m2pkg
         return replace(self, area_per_mass_m2pkg=per_mass[keep]) if isinstance(per_mass, np.ndarray) else self
 
@@ -512,7 +512,7 @@ def _without_gap(t_imu: FloatArray, at: FloatArray, reach_s: float) -> BoolArray
 
 
 def too_sparse(bet: TrajectorySolution, window_s: float) -> GateError:
-    """Say that no window of so many seconds has whole inertial data."""
+    """Message that no window of that length has complete inertial data."""
     usual = float(np.median(np.diff(bet.imu_time_s))) if len(bet.imu_time_s) > 1 else np.inf
     return GateError(
         f"accelerometer and rates: no {window_s:.1f} s with samples of both at most {LARGEST_GAP_S:g} s apart "

@@ -209,7 +209,7 @@ class VectorObservations:
         return self.measured.shape[1] == 3
 
     def directions_body(self) -> FloatArray:
-        """Measured unit vectors ``(r, 3)`` in body axes, the sensor taken as mounted nominally and free of errors."""
+        """Measured unit vectors ``(r, 3)`` in body axes, assuming nominal mounting and no sensor errors."""
         sensor = self.measured if self.is_field else direction_from_sun_angles(self.measured)
         return unit(sensor @ self.dcm_body_sensor.T)
 
@@ -419,7 +419,7 @@ class Knots:
 
 @dataclass
 class Fit:
-    """Where the fit stands, and what it ends with.
+    """State of the fit during the iterations, and its final results.
 
     Parameters
     ----------
@@ -549,7 +549,7 @@ def _links(fit: Fit, knots: Knots) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _volume_slope(observed: VectorObservations, line: Linear, fit: Fit, own: FloatArray) -> FloatArray:
-    """Slope of half the band's log-determinant with a sensor's errors, (p,); ``own`` (n, 6, 6) inverts the band.
+    """Derivative of half the band's log-determinant by a sensor's errors, (p,); ``own`` (n, 6, 6): the band's inverse.
 
     The change of a derivative with an error is that of the error's derivative with a rotation, taken by difference.
     """
@@ -589,7 +589,7 @@ def _update_density(fit: Fit, knots: Knots, own: FloatArray, next_by_own: FloatA
 
 
 def _misfit(observed: VectorObservations, line: Linear, fit: Fit, cross: FloatArray) -> tuple[float, float]:
-    """Sum of squared residuals in units of their noise, and what it should be after the fit."""
+    """Sum of squared normalised residuals, and its expected value after the fit."""
     late = np.swapaxes(line.by_errors, 1, 2)
     mixed = line.by_knot @ cross[observed.knot][:, :, observed.terms] @ late
     fitted = line.by_knot @ fit.covariance[observed.knot] @ np.swapaxes(line.by_knot, 1, 2)

@@ -91,7 +91,7 @@ def doubt(failed: Sequence[str], checks: int) -> str:
 def nis_check(
     source: str, nis: FloatArray, components: int, confidence: float, allowance: bool = False, measured: str = ""
 ) -> Check:
-    """Mean normalised innovation squared (n,) of accepted points against its chi-square band; components in all.
+    """Mean normalised innovation squared (n,) of accepted points against its band: chi-square of ``components``.
 
     With an ``allowance`` for noise, not its size, residuals may be as small as they like; else ``measured`` says what
     noise they have, for the data sheet.
@@ -195,7 +195,7 @@ def beyond_gate(held_out: pd.DataFrame, gate: float) -> pd.Series[bool]:
 
 
 def held_out_checks(problem: Problem, held_out: pd.DataFrame, settings: Settings) -> list[Check]:
-    """Whether measurements that the settings hold out are where the rest of the flight predicts them.
+    """Check whether held-out measurements agree with their predictions from the rest of the flight.
 
     None of trackers that the settings leave out altogether, nor of rows that a tracker's ``every_s`` leaves out where
     nothing is held out.
@@ -312,7 +312,7 @@ def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) 
 def physical_checks(
     problem: Problem, innovations: Innovations, table: pd.DataFrame, radars: Iterable[str]
 ) -> list[Check]:
-    """One check for each estimated error of the radars that cannot have every size; a failed one names look-alikes."""
+    """One check for each estimated radar error with physical limits; if it fails, it names correlated errors."""
     out = []
     rows = table.set_index("name")
     for number, instrument in enumerate(problem.instruments):

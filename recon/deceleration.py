@@ -35,7 +35,7 @@ def deceleration_checks(telemetry: Telemetry, problem: Problem, run: ForwardPass
 
 
 def lateral_checks(telemetry: Telemetry, confidence: float) -> list[Check]:
-    """Whether forces across the axis are as small as the stated trim lets them be, where they are measured.
+    """Check whether measured normal forces are within the limits of the stated trim.
 
     Their rms over the strongest readings, over the axial mean, is the tangent of the angle between body x and the
     force: of a trimmed blunt body about its angle of attack, of a lifting one ``side_sd``; mount and bias add theirs.
@@ -102,7 +102,7 @@ def vacuum_checks(problem: Problem, run: ForwardPass, confidence: float) -> list
 
 
 def reading_jump_checks(problem: Problem, run: ForwardPass, trim_sd_rad: float, confidence: float) -> list[Check]:
-    """Whether a deceleration jumps from one reading to the next, as where rows are missing whose times were closed up.
+    """Check for jumps between consecutive decelerations, as after deleted rows whose times were closed up.
 
     From reading to reading density follows the height, and what that may differ from the neighbours' course is limited:
     a layer cools upwards by ``g / c_p`` at most before it overturns, so that ``d ln rho`` differs by `_OVERTURNING` of

@@ -316,7 +316,7 @@ def observe(time_s: FloatArray, instruments: tuple[Instrument, ...]) -> tuple[Ob
 
 @dataclass(frozen=True)
 class ForwardPass:
-    """What the smoother needs of a linear (or linearised) filter, node by node."""
+    """Results of a linear (or linearised) filter pass that the smoother uses, node by node."""
 
     charts: States
     steps: Steps
@@ -676,7 +676,7 @@ def record(innovations, row, s, y, used, count, variance):
 
 @inlined
 def gain_and_update(x, p, w, y, factor, count, used, considered, wander_sd, gain):
-    """Schmidt's update in place: ``K = P H^T S^-1``, no gain for considered errors, whose own covariance stays."""
+    """Schmidt's update in place: ``K = P H^T S^-1``; considered errors get no gain and keep their own covariance."""
     size = len(x)
     column, k = np.empty(3), np.empty((3, size))
     any_considered = False

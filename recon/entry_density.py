@@ -64,7 +64,7 @@ _LAYER_M = 250.0  # over which rows are one knot of the atmosphere as flown: a f
 
 @dataclass(frozen=True)
 class DragHistory:
-    """What the deceleration says of the air at a trajectory's times (n,).
+    """Drag and density information from the deceleration at a trajectory's times (n,).
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def temperature_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence
 
 
 class _Layer(NamedTuple):
-    """Layer in which a profile is farthest off: its mean, over its sd, most of that, and its heights in words."""
+    """Layer in which a profile deviates most: mean deviation, the same over its sd, its limit, and heights as text."""
 
     mean: float
     away: float
@@ -400,7 +400,7 @@ def drag_jump_check(table: pd.DataFrame, stated: AtmosphereProfile, confidence: 
 
 
 def profile_as_flown(stated: AtmosphereProfile, table: pd.DataFrame) -> AtmosphereProfile:
-    """Stated atmosphere with density and temperature as flown where the deceleration knows density better.
+    """Stated atmosphere, with as-flown density and temperature where the deceleration gives a smaller density sd.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where was the vehicle, how was it oriented, and how accurately is that known, if the data are as stated?
+"""Position and orientation of the vehicle, and their accuracy, on the assumption that the data are as stated.
 
 One estimate: inertial sensors propagate the state, trackers (radars, receivers, barometers) correct it, a smoother
 carries later data back to every earlier time, and the whole is repeated about the smoothed trajectory until that no
@@ -140,7 +140,7 @@ class TrajectorySolution:
 
     @property
     def settings(self) -> Settings:
-        """Settings that it was made with."""
+        """Settings of the estimate."""
         chosen = self.provenance["settings"]
         assert isinstance(chosen, dict)
         return Settings(**chosen)
@@ -231,7 +231,7 @@ def estimate(
 
 
 def _provenance(telemetry: Telemetry, settings: Settings, problem: Problem, passes: int) -> dict[str, object]:
-    """From what a trajectory was made, and how."""
+    """Inputs and provenance of a trajectory."""
     return {
         "flight": telemetry.name,
         "settings": asdict(settings),
@@ -294,7 +294,7 @@ def linearised(telemetry: Telemetry, settings: Settings) -> Linearised:
 
 
 def _assumptions(telemetry: Telemetry) -> dict[str, object]:
-    """What stands for a sensor that the flight did not have, and the planet where it is not the Earth."""
+    """Assumptions that replace a missing sensor, and the planet if it is not the Earth."""
     out: dict[str, object] = {} if telemetry.planet == WGS84 else {"planet": name_of(telemetry.planet)}
     trim_deg = float(np.rad2deg(telemetry.motion.trim_sd_rad))
     if trim_deg > 0.0:
@@ -394,7 +394,7 @@ def _series(
 def _iterate(
     problem: Problem, settings: Settings, report: Progress
 ) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...], SpinPhase | None]:
-    """Problem with its radars' lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations.
+    """Problem with servo lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations.
 
     Last, what the phase of a fast spin was chosen from.
     """
@@ -483,7 +483,7 @@ def datum_trajectory(problem: Problem, mounting: Mounting, states: States, trian
 
 
 def turned_velocity_cov(velocity_mps: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Second-order part (n, 3, 3) of the covariance of velocities whose size a deceleration gives, not their direction.
+    """Second-order covariance (n, 3, 3) of velocities whose magnitude, not direction, is known from a deceleration.
 
     Turned by an unknown lift, a velocity ``V`` that errs by ``c`` across has ``|c|^2 / (2 V)`` less along, of normal
     ``c`` with covariance ``A`` a mean square of ``(tr(A)^2 + 2 tr(A^2)) / (4 V^2)``; ``V^2`` is that of both parts.

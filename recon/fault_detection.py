@@ -295,7 +295,7 @@ def adjoint_update(by_state, by_error, slot, gain, covariance, residual, varianc
 
 @inlined
 def read_columns(by_state, by_error, slot, column, h):
-    """Which errors a measurement reads, into ``column``, and its partials by them (3, count); their number."""
+    """Errors that a measurement depends on, into ``column``, and its partials by them (3, count); their number."""
     for a in range(9):
         column[a] = a
         for r in range(3):

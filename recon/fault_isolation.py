@@ -65,7 +65,7 @@ INFLATION = 3.0  # times the estimate: wide enough not to pull, for the estimate
 
 @dataclass(frozen=True)
 class LeftOut:
-    """One tracker left out: which checks still fail without it, and how far away that solution lies.
+    """Solution without one tracker: the checks that still fail, and its distance from the full solution.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Adaptation:
-    """What one reconstruction found in the data that others of the same flight, to be compared with it, start from.
+    """Corrections found by one reconstruction and reused by re-runs of the same flight.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def leave_one_out(
     sources: tuple[str, ...],
     rerun: Callable[[str], tuple[Trajectory, tuple[Check, ...], bool]],
 ) -> tuple[tuple[LeftOut, ...], FloatArray]:
-    """Result without each source, and what to add to the covariance, (n, 9, 9).
+    """Leave-one-out results of all sources, and the covariance to add, (n, 9, 9).
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def _supported(left_out: tuple[LeftOut, ...]) -> list[LeftOut]:
 
 
 def _compared(smoothed: Trajectory, other: Trajectory) -> tuple[BoolArray, FloatArray, BoolArray]:
-    """Times (n,) that both solutions cover, their difference (k, 9) there, and where it is further than allowed."""
+    """Common times (n,) of two solutions, their difference (k, 9), and where it exceeds its limit."""
 
     inside = np.asarray((smoothed.time_s >= other.time_s[0]) & (smoothed.time_s <= other.time_s[-1]))
     there, mine = (resample(path, smoothed.time_s[inside]) for path in (other, smoothed))
@@ -425,7 +425,7 @@ def _tracker_hypothesis(failed: list[Check], left_out: tuple[LeftOut, ...], iner
 
 
 def _single_tracker_hypothesis(failed: list[Check]) -> list[Issue]:
-    """What can be concluded where no tracker could be left out."""
+    """Hypotheses for a flight in which no tracker could be left out."""
     about = [v for v in failed if v.code in _ABOUT_SOURCES and not (v.code == "data-sheet" and v.source in TRIADS)]
     about = [v for v in about if not is_generous(v)]
     if not about:

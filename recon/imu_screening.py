@@ -86,7 +86,7 @@ class BridgedSensor:
 
 
 class _Unused(NamedTuple):
-    """What is bridged: all times (n,), rejected values, else NaN, and at which stop samples are, 0 none (both n, k)."""
+    """Samples to be bridged: times (n,), rejected values (NaN if none), saturated side (0 none), both (n, k)."""
 
     time_s: FloatArray
     rejected: FloatArray
@@ -177,7 +177,7 @@ def _find_offsets(
 def _exclude(
     t: FloatArray, x: FloatArray, good: BoolArray, rejected: list[TransientOffset], findings: list[Issue], name: str
 ) -> FloatArray:
-    """Take rejected samples out of ``good`` (n, 3), in place, and return them; NaN where there is none (n, 3)."""
+    """Remove rejected samples from ``good`` (n, 3), in place, and return them (n, 3), NaN elsewhere."""
     out = np.full(x.shape, np.nan)
     for d in rejected:
         rows = np.flatnonzero((t >= d.start_s) & (t <= d.end_s) & good[:, d.axis])
@@ -254,7 +254,7 @@ def with_noise(sensor: BridgedSensor, noise_sd: float) -> BridgedSensor:
 
 
 def _at_a_stop(x: FloatArray, good: BoolArray) -> IntArray:
-    """1 and -1 where samples (n, 3) that are not good stand at the largest and smallest value of their column."""
+    """Saturated side of unusable samples (n, 3): 1 at their column's largest value, -1 at its smallest, else 0."""
     stands = np.isfinite(x) & ~good
     high, low = stands & (x == np.nanmax(x, axis=0)), stands & (x == np.nanmin(x, axis=0))
     return high.astype(np.int64) - low.astype(np.int64)
@@ -430,7 +430,7 @@ def _jumps(time_s: FloatArray, column: FloatArray, noise_sd: float) -> tuple[Flo
 
 
 def _significant_jumps(size: FloatArray, sd: FloatArray) -> IntArray:
-    """Jumps (k,) larger than chance and than any other within reach."""
+    """Significant jumps (k,), each the largest within reach."""
     from scipy.ndimage import maximum_filter
 
     height = np.abs(size) / sd

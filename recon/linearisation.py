@@ -100,7 +100,7 @@ def follow_track(
 
 
 def needs_no_reference(problem: Problem) -> bool:
-    """Whether the filter's own estimate is what to linearise about, once: where a deceleration is measured.
+    """Whether one pass, linearised about the filter's own estimate, suffices: if a deceleration is measured.
 
     The filter is then on the drag throughout. About a smoothed path the drag is an exponential of errors a hundred
     times the process noise: half a scale height up with as much more drag is to first order the same flight, to second
@@ -219,7 +219,7 @@ def _likely(found: list[tuple[float, float, States]]) -> list[States]:
 
 
 def _coarse(thinned: Problem) -> tuple[Problem, IntArray]:
-    """Problem on at most about `_COARSE_NODES` nodes, and which these are; as it is where it has no more.
+    """Problem on about `_COARSE_NODES` nodes at most, and their indices; unchanged if it has no more.
 
     It finds the likely parts alone, which are then compared on all nodes.
     """

@@ -1,4 +1,4 @@
-"""What should each instrument have measured, how does that change with the state, and how large is its noise?
+"""Measurement models of all instruments: predictions, partials by the state, and noise.
 
 A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was observed at ``t - tau`` (``tau``: time
 tag minus true time), so
@@ -181,7 +181,7 @@ class Instrument:
         return time_s, self.value[first], variance
 
     def slots(self, model: ErrorModel) -> IntArray:
-        """Which error (`SLOTS`,) of the model stands in each slot; -1 for none."""
+        """Index of the model's error in each slot (`SLOTS`,); -1 for none."""
         names = SLOT_NAMES[self.kind]
         common = range(len(_OWN_RADAR), len(_OWN_RADAR) + len(instruments.SITES.states))  # to all sites
         shared = _OWNERS.get(self.kind, {})
@@ -222,7 +222,7 @@ def instrument_of(
 def radar_instrument(
     name: str, record: RadarRecord, arm_body_m: FloatArray, traverse: bool = True, planet: Planet = WGS84
 ) -> Instrument:
-    """One radar; a missing component leaves the others."""
+    """Instrument of one radar; components may be missing individually."""
     site = record.spec
     sd = _noise(record, [site.range_sd_m, *site.angles_sd_rad], slice(0, 3))
     if traverse:
@@ -316,7 +316,7 @@ def gnss_instruments(
 
 
 def barometer_instrument(name: str, record: BarometerRecord, accelerometer_m: FloatArray) -> Instrument:
-    """Height by pressure of the datum's point."""
+    """Pressure height as a measurement of the datum's height."""
     first = next(iter(record.height_m[np.isfinite(record.height_m)]), 0.0)
     value = np.column_stack([record.height_m, np.full((len(record.height_m), 2), np.nan)])
     return instrument_of(

@@ -65,7 +65,7 @@ _BALLISTIC = ("drag_sd", "drag_time_constant_s", "side_sd", "acceleration_densit
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """One level: where it stands in flight.toml, what is stated there and what the flight makes of it.
+    """One noise level: its key in flight.toml, its stated value and its estimate from the flight.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class NoiseLevel:
 
     @property
     def changed(self) -> bool:
-        """Whether something else is proposed than what is stated."""
+        """Whether the proposed value differs from the stated one."""
         return self.proposed != self.stated
 
 
@@ -139,7 +139,7 @@ class _Place:
 def noise_levels(
     telemetry: Telemetry, settings: Settings | None = None, progress: Progress | None = None
 ) -> NoiseLevels:
-    """Levels that the flight's innovations make most probable.
+    """Most probable noise levels, given the flight's innovations.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def _with(telemetry: Telemetry, places: list[_Place], logs: FloatArray) -> Telem
 
 
 def _places(telemetry: Telemetry, settings: Settings) -> list[_Place]:
-    """Levels above zero of everything that is used."""
+    """All non-zero noise levels in use."""
     out: list[_Place] = []
     for kind, record_type in (("radars", RadarSite), ("gnss", GnssSpec), ("barometers", BarometerSpec)):
         for name, record in getattr(telemetry, kind).items():
@@ -254,7 +254,7 @@ class _Likelihood:
     about: Linearised
 
     def log_likelihood(self, logs: FloatArray) -> float:
-        """Of the innovations."""
+        """Log likelihood of the innovations."""
         problem = self.about.problem_of(_with(self.telemetry, self.places, logs), self.settings)
         run = ekf.forward(problem, self.about.states, self.settings.engine)
         return single_faults.log_likelihood(problem, run)[0]

@@ -123,7 +123,7 @@ class _Normal:
         return _Normal(self.square, pick @ self.gram @ pick.T, self.moment @ pick.T)
 
     def rest(self, phase_rad: FloatArray) -> FloatArray:
-        """Share of the square (w, l, p) that is left at phases (p,), of three columns."""
+        """Residual share (w, l, p) of the squared force at phases (p,), with three columns."""
         turned = (self.moment[:, :, None] * np.exp(-1j * phase_rad)[:, None]).real
         solved = np.linalg.solve(self.gram[:, :, None], turned[..., None])[..., 0]
         return np.asarray(1.0 - np.einsum("wlpi,wlpi->wlp", turned, solved) / self.square[:, None, None])
@@ -306,7 +306,7 @@ def _refined(log: FloatArray, step: float) -> tuple[float, float]:
 
 
 def common_angle(near: float, logs: FloatArray, step: float) -> tuple[float, float]:
-    """Angle that all windows have, and its sd with what they differ by beyond their noise.
+    """Random-effects mean of the windows' angles, and its sd.
 
     Parameters
     ----------

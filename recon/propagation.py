@@ -76,7 +76,7 @@ MOST_PARTS = 64  # backwards in time drag grows without bound
 
 
 class Motion(NamedTuple):
-    """Time grid that contains every node, and what acts on it: as kernels take it, whatever carries the state.
+    """Time grid that contains every node, and the inputs of the motion, in the form kernels take for either model.
 
     Parameters
     ----------
@@ -275,9 +275,9 @@ def ballistic_motion(
 
 
 def with_disturbances(motion: Motion, spec: MotionSpec) -> Motion:
-    """Motion with the noise of the spans that flight.toml states as disturbed, of accelerations and of rates.
+    """Motion with process noise added to accelerations and rates in the spans of ``[[motion.disturbed]]``.
 
-    They are vibration that rectifies to a bias, a saturated gyro, thrust.
+    Causes are vibration that rectifies to a bias, a saturated gyro, or thrust.
     """
     force, rate = motion.force_density.copy(), motion.rate_density.copy()
     for d in spec.disturbed:
@@ -385,7 +385,7 @@ def correct_sample(before, after, errors, offset, late, body_actual, body_mount,
 
 @inlined
 def coning_and_sculling(force, d_force, rate, d_rate, dt):
-    """Add to mean force and rate (3,), in place, what both do to each other inside a step (signals straight in time).
+    """Add coning and sculling corrections of a step to mean force and rate (3,), in place (linear signals).
 
     ``d_force``, ``d_rate`` are their changes over the step: ``w + dt/12 w x dw``, ``f + dt/12 (w x df - dw x f)``.
     """

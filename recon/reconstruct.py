@@ -44,7 +44,7 @@ _LINEAR_LAG_S = 0.03  # of an oscillation of a second's period a tenth of a radi
 
 @dataclass(frozen=True)
 class Case:
-    """What an estimate is made of."""
+    """Inputs of an estimate."""
 
     telemetry: Telemetry
     settings: Settings
@@ -66,7 +66,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Assessed:
-    """A case with its solution, what was known before any estimate, and single faults that explain what failed."""
+    """A case with its solution, corrections known before any estimate, and single faults for the failed checks."""
 
     case: Case
     solution: TrajectorySolution
@@ -140,7 +140,7 @@ def reconstruct(
 
 
 def _adapted(now: Assessed, change: Change | None, report: Progress) -> Assessed:
-    """What stands after a change that a rule proposes."""
+    """Result after a proposed change: the new one if the change is accepted, else the current one."""
     if change is None:
         return now
     stands = None
@@ -158,7 +158,7 @@ def _adapted(now: Assessed, change: Change | None, report: Progress) -> Assessed
 
 
 def _moved(before: Trajectory, after: Trajectory) -> str:
-    """How far a trajectory has moved, in words."""
+    """Text that states how far a trajectory has moved."""
     t = after.time_s[(after.time_s >= before.time_s[0]) & (after.time_s <= before.time_s[-1])]
     error = difference(resample(after, t), resample(before, t))
     metres, rad = (float(np.linalg.norm(error[:, k : k + 3], axis=1).max()) for k in (0, 6))
@@ -207,7 +207,7 @@ def tracker_clocks(now: Assessed, _report: Progress) -> Change | None:
 
 
 def wider_priors(now: Assessed, _report: Progress) -> Change | None:
-    """Inflate priors that are too small; checks, which judge what was stated, stay those of the first."""
+    """Inflate priors that are too small; the checks of the stated priors are kept."""
     first, known = now.solution, now.at_rest.inflated_sd
     inflated = known | fault_isolation.inflated_priors(first.consistency_checks, first.sensor_errors)
     inflated |= fault_isolation.inflated_clocks(first.adaptation.lag, now.case.telemetry)
@@ -224,7 +224,7 @@ def wider_priors(now: Assessed, _report: Progress) -> Change | None:
 
 
 def contradicting_trackers(now: Assessed, report: Progress) -> Change | None:
-    """Reject points of the one tracker that contradicts the rest, or let the covariance include how far they differ."""
+    """Reject points of the one tracker that contradicts the rest, or add the differences to the covariance."""
     case, solution = now.case, now.solution
     sources = trackers(case.telemetry, case.settings)
     if len(sources) < 2 or not fault_isolation.any_tracker_fails(solution.consistency_checks, sources):

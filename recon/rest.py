@@ -68,7 +68,7 @@ def rest_instruments(telemetry: Telemetry, start_s: float, point_ecef_m: FloatAr
 
 
 def _mean_var(record: TriadRecord, mean: RestReadings) -> float:
-    """Variance of each axis of a mean: noise, as large as it is there or as stated, and rounding."""
+    """Variance of each axis of a mean: the larger of measured and stated noise, plus rounding."""
     noise = max(mean.noise_sd, record.spec.noise_sd)
     return noise**2 / mean.count + record.spec.resolution**2 / 12.0
 

@@ -1,4 +1,4 @@
-"""What may an analyst choose about a reconstruction? Every setting with its type, allowed values and default, once.
+"""Settings of a reconstruction, each with its type, allowed values and default.
 
 The same names are the keys of ``[reconstruction]`` in flight.toml; `Settings.from_mapping` reads them.
 """
@@ -39,7 +39,7 @@ def _rules() -> dict[str, TypeAdapter[Any]]:
 
 @dataclass(frozen=True)
 class Settings:
-    """What an analyst may choose.
+    """Settings of a reconstruction.
 
     Parameters
     ----------

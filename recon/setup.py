@@ -627,7 +627,7 @@ def _start_at_rest(
     time_s: FloatArray,
     node_index: IntArray,
 ) -> States:
-    """Start without velocity: where tracking has it at rest, or from where it came to the first track point."""
+    """Initial state with zero velocity: at the tracked rest, or where the path to the first track point began."""
     t, points = track
     still = points[(t >= time_s[0] - SAME_INSTANT_S) & (t <= at_rest[1])]
     start = replace(start, velocity_ecef_mps=np.zeros(3))

@@ -50,7 +50,7 @@ _KINDS = {  # of a triad's errors, by the name that they have in the error model
 
 @dataclass(frozen=True)
 class Single:
-    """One hypothesis: what would be wrong, and the flight as it then is.
+    """One fault hypothesis: its words, and the telemetry with that fault corrected.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def with_noise(problem: Problem, noisier: dict[str, float]) -> Problem:
 
 
 def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None) -> list[Single]:
-    """Both triads' corrections for what the oscillation shows; empty where it shows nothing."""
+    """Corrections of both triads according to the oscillation; empty if it shows no error."""
     force, rate = telemetry.accelerometer, telemetry.rates
     if force is None or rate is None:
         return []

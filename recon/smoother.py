@@ -339,7 +339,7 @@ def keep_moments(run: Filtered, k: int, p: FloatArray, triangles: FloatArray, va
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """Square root ``B`` with ``B B^T`` a covariance that may be singular; taken of its correlations."""
+    """Square root ``B`` with ``B B^T`` equal to a possibly singular covariance; computed from its correlations."""
     sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     values, vectors = np.linalg.eigh(covariance / np.outer(sd, sd))
     return np.asarray(sd[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -51,7 +51,7 @@ WIDE_SD = {
 
 @dataclass(frozen=True)
 class Miss:
-    """Known place minus smoothed position, along north, east, down there, and how common errors would move it."""
+    """Known minus smoothed position, north, east, down, and its response to errors common to all sites."""
 
     place: KnownPlace
     residual_m: FloatArray  # (k,) 2 without a height, else 3
@@ -60,7 +60,7 @@ class Miss:
 
     @property
     def chi2(self) -> float:
-        """Of the miss by itself."""
+        """Chi-square of the difference by itself."""
         return float(self.residual_m @ np.linalg.solve(self.covariance, self.residual_m))
 
 
@@ -71,7 +71,7 @@ def missed_places(
     arm_body_m: FloatArray,
     places: tuple[KnownPlace, ...],
 ) -> list[Miss]:
-    """By how much a trajectory misses places that are known.
+    """Differences of a trajectory from known positions.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def unchecked_state(telemetry: Telemetry) -> list[Issue]:
 
 
 def rests_on(telemetry: Telemetry, settings: Settings) -> tuple[str, ...]:
-    """One line each for position, height and azimuth: on what they rest and to how much, where no residual shows it."""
+    """One line each on the source of position, height and azimuth and its uncertainty, if no residual shows it."""
     radars = [r.spec for name, r in telemetry.radars.items() if name not in settings.without]
     receivers = [name for name, r in telemetry.gnss.items() if name not in settings.without and r.has_positions]
     checked = f"; checked by {', '.join(place.name for place in telemetry.places)}" if telemetry.places else ""

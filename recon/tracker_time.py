@@ -37,7 +37,7 @@ Filtered = Callable[[Single], tuple[Problem, ForwardPass, States]]
 
 
 class _Tried(NamedTuple):
-    """A lag with the log likelihood that it gives, the innovations' mean square, and what the filter finds left."""
+    """A trial lag with its log likelihood, the mean square of the innovations, and the remaining lag in the filter."""
 
     late_s: float
     gain: float
@@ -112,7 +112,7 @@ def _over_noise(problem: Problem, run: ForwardPass) -> tuple[float, float]:
 
 
 def lags(telemetry: Telemetry, faults: tuple[SingleFault, ...], sensor_errors: pd.DataFrame) -> dict[str, float]:
-    """By how much to set trackers' tags back, s: what explains failed checks best, if it is a lag.
+    """Corrections of trackers' tags, s: the lag that explains failed checks best, if the best explanation is a lag.
 
     Without such an explanation of anything, time biases that are known and too large for the series about them.
     """

@@ -1,4 +1,4 @@
-"""Where do angles and ranges of several sites meet? Points to start a filter from that no site fixes by itself.
+"""Initial positions from angles and ranges of several sites, none of which fixes a position by itself.
 
 At times of the sites' readings, at most two a second, the others' readings are interpolated where they have some on
 both sides within `_BRIDGED_S`. With three components or more a point is their weighted least-squares solution

@@ -38,7 +38,7 @@ class Shift(Section):
     uniform: tuple[Number, Number] | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         given = [name for name in type(self).model_fields if getattr(self, name) is not None]
         if len(given) != 1:
             names = ", ".join(type(self).model_fields)
@@ -125,7 +125,7 @@ class Window(Section):
     history_s: Annotated[float, Field(ge=1e-3, le=10.0)] = 0.1
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         if not self.from_s < self.to_s:
             yield "to_s", self.to_s, f"after from_s = {self.from_s:g} is wanted"
         ratio = self.history_s / self.record_s

@@ -256,7 +256,7 @@ class Dropouts(Section):
     outages_s: tuple[tuple[Time, Time], ...] = ()
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         for k, (start, stop) in enumerate(self.outages_s):
             if stop <= start:
                 yield f"outages_s.{k}", [start, stop], "the outage does not end after it starts"
@@ -382,7 +382,7 @@ class AirRefraction(Section):
     residual: Annotated[float, Field(ge=-10.0, le=10.0)] = 1.0
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         heights = [height for height, _ in self.profile or ()]
         if any(b <= a for a, b in pairwise(heights)):
             yield "", None, "heights of the refractivity profile must increase"
@@ -424,7 +424,7 @@ class Radar(Section):
     dropouts: Dropouts | None = None
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         for key in ("range_rate_bias_mps", "range_rate_wander_mps"):
             if getattr(self, key, 0.0) > 0.0 and self.range_rate_sd_mps == 0.0:
                 words = "of a range rate that is not measured: state its noise, range_rate_sd_mps, too"
@@ -475,7 +475,7 @@ class FilmQuality(Section):
     loaded_shape_deg: tuple[ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle, ShapeAngle] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         if self.interlace_s and self.readout_s:
             yield "readout_s", self.readout_s, "either fields (interlace_s) or rows in turn"
 
@@ -494,7 +494,7 @@ class Video(Section):
     imaging: FilmQuality = FilmQuality()
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         if self.stop_s < self.start_s:
             yield "stop_s", self.stop_s, f"after start_s = {self.start_s:g} is wanted"
         if not self.start_s <= self.benchmark_s <= self.stop_s:

@@ -64,7 +64,7 @@ class TimeSpan(Section):
     record_s: Duration = 0.004
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         span, record, step = self.stop_s - self.start_s, self.record_s, self.step_s
         if not self.start_s <= self.telemetry_from_s < self.stop_s:
             words = f"start_s = {self.start_s:g} <= telemetry_from_s < stop_s = {self.stop_s:g} is wanted"
@@ -157,7 +157,7 @@ class ScenarioFile(Section):
         return alone | {f"videos.{name}": video for name, video in self.videos.items()}
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         start, stop = self.time.telemetry_from_s, self.time.stop_s
         words = f"a time of the telemetry, {start:g} to {stop:g} s, is wanted"
         if not self.radars and not self.gnss:

@@ -82,7 +82,7 @@ class Turbulence(Section):
     to_m: Altitude
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         if self.to_m - self.from_m < 2.0 * self.length_m:
             yield "", None, "a band from_m to to_m of at least two length_m is wanted"
 
@@ -137,7 +137,7 @@ class DayOfFlightAtmosphere(Section):
         return value
 
     def key_faults(self) -> Iterable[KeyFault]:
-        """Yield a fault for each key that contradicts another."""
+        """Yield inconsistencies between keys."""
         if self.from_ is not None and "base" in self.model_fields_set:
             yield "from", self.from_, f"base = '{self.base}' states another air; keep one of the two"
         if self.mean_wind is not None and not self.winds:
