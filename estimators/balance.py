@@ -1,4 +1,4 @@
-"""Forces and moments that a deflected vehicle needs for the motion that the centerbody's sensors measured.
+"""Which forces and moments does the motion that the centerbody's sensors measured require of a deflected vehicle?
 
 Momentum and angular momentum of two rigid bodies that turn against each other about the joint, exact in the deflection
 and in the rates. Body axes are the centerbody's; ``R(theta)`` turns shell axes into them, with ``rho`` the shell's c.g.

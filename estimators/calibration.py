@@ -1,4 +1,4 @@
-"""Focal length, principal point and distortion of a lens from pictures of a flat checkerboard's corners.
+"""What are the focal length, principal point and distortion of a lens, by pictures of a flat checkerboard's corners?
 
 OpenCV finds, from some twenty pictures, the lens that minimises the corners' distances, each picture with a pose of
 its own. Corners of one picture err together (a bent board, blur, light, what the lens's model leaves out there), so the

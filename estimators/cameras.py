@@ -1,4 +1,4 @@
-"""Deflection from the films of several cameras, simultaneous or switched: one history with one covariance.
+"""How did the shell deflect, by the films of several cameras, simultaneous or switched? One history, one covariance.
 
 Every film is fitted by its own oriented camera (`estimators.camera`), relative to its own benchmark frame. One smooth
 process of the deflection is then fitted to all frames at once, each camera ``c`` with systematic errors of its own::

@@ -1,4 +1,4 @@
-"""Joint least squares for the deflection's spline and the inputs, with banded normal equations.
+"""How are the deflection's spline and the inputs estimated jointly? Least squares with banded normal equations.
 
 The deflection's lateral vector is a cubic spline with even knots, of which four basis functions differ from
 zero at a time: rows of the least-squares problem are sparse in its coefficients, and their normal matrix ``N`` is a

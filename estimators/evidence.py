@@ -1,4 +1,4 @@
-"""Readings of the deflection by one method, and the uncertain inputs on which they depend.
+"""What does one method read of the deflection, and on which uncertain inputs do its readings depend?
 
 Every method reads the deflection with an error that is linear in named inputs, which several methods share (the flow's
 angle, coefficients, masses, the accelerometer's errors), and in the oscillation of the joint::

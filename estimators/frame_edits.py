@@ -1,4 +1,4 @@
-"""An analyst's edits of a frame: masked regions, points of the edge, places of features.
+"""Which edits does an analyst make in a frame? Masked regions, points of the edge, places of features.
 
 `EditedFrame` is a picture with the decisions about it (`flightmodel.camera_edits`); the fit looks for edge and features
 through it alone:

@@ -1,4 +1,4 @@
-"""Differences of edge points and features found in a frame from their predictions for a deformed shell.
+"""How far are edge points and features found in a frame from their predictions for a deformed shell?
 
 Residuals are found minus predicted, with the prediction's derivatives by all that is fitted: the deformation, the
 camera, the shell's lobes and the light at its edge. Lobes are a flattening that varies round the shell (with two waves

@@ -1,4 +1,4 @@
-"""Combined answer of all methods of a flight, and whether they agree.
+"""What is the combined answer of all methods of a flight, and do they agree?
 
 Camera, misalignment and trim are fused into one posterior of the deflection and of their common inputs
 (`estimators.fusion`); every pair is tested and every input scored as a fault hypothesis (`estimators.agreement`); the

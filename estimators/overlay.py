@@ -1,4 +1,4 @@
-"""Simulated view of the real camera at the estimated deflection, for visual comparison (seed paper Figure 2.3).
+"""How would the real camera see the estimated deflection? Pictures to compare by eye (seed paper Figure 2.3).
 
 The virtual camera's view is drawn beside and over the filmed frame: the shell deflected as estimated, shaded by how it
 faces the camera, ``grey = 60 + 150 |n . v|``, with the mesh's lines on it; where the centerbody hides it, it is not

@@ -1,4 +1,4 @@
-"""Tracking of the shell's own surface texture from the benchmark frame to other frames.
+"""Where has the shell's own surface texture moved between the benchmark frame and another frame?
 
 Patches of the benchmark frame's picture are the templates. A pixel of the oriented camera looks at one point of the
 undeflected shell (sphere tracing against the tori), and a patch, small and on one torus, is a piece of the plane that

@@ -1,4 +1,4 @@
-"""Predicted view of the camera for a given deflection of the shell.
+"""What does the camera see at a given deflection of the shell?
 
 The shell's edge against the sky is the limb of the outermost torus, or of the user's mesh, a closed-form curve of the
 deformed geometry; it is projected, never rendered, and so are the features painted on the shell. A point ``P`` of the

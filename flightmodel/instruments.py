@@ -1,4 +1,4 @@
-"""Properties of instruments on which flight file, filter and simulator must agree: errors, mounting, keys.
+"""On which properties of an instrument must flight file, filter and simulator agree? Errors, mounting, keys.
 
 Each instrument is one record in SI: where it sits, and one row an error. A row (`ErrorRow`) states the error's prior in
 flight.toml, the error states it becomes in the filter, and the sizes from which the simulator draws it. From the rows

@@ -128,11 +128,10 @@ def _require_own_packages() -> None:
     ours = Path(__file__).parents[1]
     for name in ("flightmodel", "recon", "estimators", "synthetic_flight"):
         found = find_spec(name)
-        place = Path(found.origin) if found and found.origin else ours / name
-        if ours / name not in place.parents:
+        if found and found.origin and ours / name not in Path(found.origin).parents:
             raise ImportError(
-                f"{place} hides the package '{name}' of postflight ({ours / name}): rename it, start Python in another "
-                "folder, or install postflight in an environment of its own"
+                f"{found.origin} hides the package '{name}' of postflight ({ours / name}): rename it, start Python in "
+                "another folder, or install postflight in an environment of its own"
             )
 
 

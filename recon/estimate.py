@@ -1,4 +1,4 @@
-"""Position and orientation of the vehicle, and their accuracy, on the assumption that the data are as stated.
+"""Where was the vehicle, how was it oriented, and how accurately is that known, if the data are as stated?
 
 One estimate: inertial sensors propagate the state, trackers (radars, receivers, barometers) correct it, a smoother
 carries later data back to every earlier time, and the whole is repeated about the smoothed trajectory until that no
@@ -169,15 +169,16 @@ def estimate(
     where it does not state them.
     """
     report = progress or (lambda _fraction, _what: None)
-    known, screened = None, adaptation
-    while known != screened:  # each round settles one of the two kinds
+    screened, settled = adaptation, False
+    while not settled:  # clock jumps first, then transient offsets
         adaptation = screened
         report(0.0, "bridging gaps")
         sensors = bridge_inertial_sensors(telemetry, adaptation)
         problem = _adapted_problem(telemetry, settings, sensors, adaptation)
         problem, run, smoothed, reference, passes, spans, phase = _iterate(problem, settings, report)
         screened = _screened(telemetry, problem, run, sensors, adaptation)
-        known = replace(screened, jumps=adaptation.jumps or (), rejected_offsets=adaptation.rejected_offsets or ())
+        known = adaptation.jumps or (), adaptation.rejected_offsets or ()
+        settled = (screened.jumps, screened.rejected_offsets) == known
     adaptation = screened
 
     report(0.95, "testing consistency")

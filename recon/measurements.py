@@ -1,4 +1,4 @@
-"""Measurement models of all instruments: predictions, partials by the state, and noise.
+"""What does each instrument measure, how does its reading change with the state, and how large is its noise?
 
 A tracked point at ``d`` from the accelerometer in body axes, tagged ``t``, was observed at ``t - tau`` (``tau``: time
 tag minus true time), so

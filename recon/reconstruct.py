@@ -20,7 +20,6 @@ the trajectory. Where no points of one tracker explain the contradiction, the co
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,14 +83,14 @@ class Change:
         What was changed.
     case : Case or None
         What is estimated instead; None where nothing is.
-    judged : callable
+    selected : callable
         Takes the new solution, and returns what stands; None where that is ``otherwise``.
     otherwise : TrajectorySolution
     """
 
     words: str
     case: Case | None
-    judged: Callable[[TrajectorySolution], TrajectorySolution | None]
+    selected: Callable[[TrajectorySolution], TrajectorySolution | None]
     otherwise: TrajectorySolution
 
 
@@ -143,14 +142,17 @@ def _adapted(now: Assessed, change: Change | None, report: Progress) -> Assessed
     """Result after a proposed change: the new one if the change is accepted, else the current one."""
     if change is None:
         return now
-    stands = None
-    if change.case is not None:
-        report(0.5, change.words)
-        with suppress(GateError):  # a case without a trajectory explains nothing
-            again = change.case.solved()
-            stands = change.judged(again)
-    if change.case is None or stands is None:
-        return replace(now, solution=change.otherwise)
+    unchanged = replace(now, solution=change.otherwise)
+    if change.case is None:
+        return unchanged
+    report(0.5, change.words)
+    try:
+        again = change.case.solved()
+    except GateError:  # a case without a trajectory explains nothing
+        return unchanged
+    stands = change.selected(again)
+    if stands is None:
+        return unchanged
     if stands.smoothed is not again.smoothed:
         return replace(now, solution=stands)
     moved = Issue(f"{change.words}: {_moved(now.solution.smoothed, again.smoothed)}", "estimated-again")
@@ -182,14 +184,14 @@ def inertial_clock(now: Assessed, _report: Progress) -> Change | None:
     known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
     words = f"{one.words.partition(': ')[2]}: corrected"
 
-    def judged(again: TrajectorySolution) -> TrajectorySolution:
+    def selected(again: TrajectorySolution) -> TrajectorySolution:
         start_s, end_s = again.smoothed.time_s[[0, -1]].tolist()
         finding = Issue(words, "clock-corrected", name, start_s, end_s)
         failed = [replace(v, source=name if sure else "") for v in first.consistency_checks if v.code == "clock-lag"]
         checks = (*(v for v in again.consistency_checks if v.code != "clock-lag"), *failed)
         return replace(again, consistency_checks=checks, findings=(*again.findings, finding))
 
-    return Change(f"{name}: {words}", replace(now.case, telemetry=one.telemetry, adaptation=known), judged, first)
+    return Change(f"{name}: {words}", replace(now.case, telemetry=one.telemetry, adaptation=known), selected, first)
 
 
 def tracker_clocks(now: Assessed, _report: Progress) -> Change | None:
@@ -199,11 +201,11 @@ def tracker_clocks(now: Assessed, _report: Progress) -> Change | None:
     if not late_s:
         return None
 
-    def judged(again: TrajectorySolution) -> TrajectorySolution | None:
+    def selected(again: TrajectorySolution) -> TrajectorySolution | None:
         return again if any(all(v.passed for v in one.consistency_checks) for one in (again, first)) else None
 
     case = replace(now.case, adaptation=replace(now.at_rest, late_s=late_s))
-    return Change(f"{' and '.join(late_s)}: time tags set right", case, judged, first)
+    return Change(f"{' and '.join(late_s)}: time tags set right", case, selected, first)
 
 
 def wider_priors(now: Assessed, _report: Progress) -> Change | None:
@@ -214,13 +216,13 @@ def wider_priors(now: Assessed, _report: Progress) -> Change | None:
     if inflated == known:
         return None
 
-    def judged(again: TrajectorySolution) -> TrajectorySolution:
+    def selected(again: TrajectorySolution) -> TrajectorySolution:
         span = again.smoothed.time_s[[0, -1]].tolist()
         found = fault_isolation.prior_inflation_findings(again.sensor_errors, inflated, *span)
         checks, residuals = first.consistency_checks, first.residuals
         return replace(again, consistency_checks=checks, residuals=residuals, findings=(*again.findings, *found))
 
-    return Change("priors wider than stated", now.case.adapted(first, inflated_sd=inflated), judged, first)
+    return Change("priors wider than stated", now.case.adapted(first, inflated_sd=inflated), selected, first)
 
 
 def contradicting_trackers(now: Assessed, report: Progress) -> Change | None:
@@ -244,7 +246,7 @@ def contradicting_trackers(now: Assessed, report: Progress) -> Change | None:
     left_out, added = fault_isolation.leave_one_out(solution.smoothed, sources, rerun)
     rejected = fault_isolation.rejected_points(left_out, held_out, solution.residuals, case.settings.gate_probability)
 
-    def judged(again: TrajectorySolution) -> TrajectorySolution | None:
+    def selected(again: TrajectorySolution) -> TrajectorySolution | None:
         if any(not v.passed for v in again.consistency_checks) or unmodelled(again) > unmodelled(solution):
             return None
         checks = fault_isolation.edit_checks_with_rejected(again.consistency_checks, again.residuals, rejected)
@@ -263,7 +265,7 @@ def contradicting_trackers(now: Assessed, report: Progress) -> Change | None:
         left_out=left_out,
     )
     without = case.adapted(solution, rejected_points=rejected) if rejected else None
-    return Change(f"points of {' and '.join(rejected)} rejected", without, judged, enlarged)
+    return Change(f"points of {' and '.join(rejected)} rejected", without, selected, enlarged)
 
 
 def shared_errors(now: Assessed, _report: Progress) -> Change | None:
@@ -275,7 +277,7 @@ def shared_errors(now: Assessed, _report: Progress) -> Change | None:
     if not (fails and names and case.telemetry.has_other_positions):
         return None
 
-    def judged(again: TrajectorySolution) -> TrajectorySolution:
+    def selected(again: TrajectorySolution) -> TrajectorySolution:
         consistent = all(v.passed for v in again.consistency_checks if v.source != survey.SITES)
         found = again.sensor_errors.set_index("name").loc[names, ["estimate", "sd"]].to_numpy(dtype=float)
         check = survey.shared_error_check(found, names, consistent)
@@ -284,7 +286,7 @@ def shared_errors(now: Assessed, _report: Progress) -> Change | None:
         )
 
     wide = replace(case.adapted(solution, inflated_sd=survey.WIDE_SD), settings=case.coarse())
-    return Change("sites wider than stated", wide, judged, solution)
+    return Change("sites wider than stated", wide, selected, solution)
 
 
 RULES: tuple[Rule, ...] = (inertial_clock, tracker_clocks, wider_priors, contradicting_trackers, shared_errors)

@@ -1,4 +1,4 @@
-"""Settings of a reconstruction, each with its type, allowed values and default.
+"""Which settings does a reconstruction have? Each with its type, allowed values and default.
 
 The same names are the keys of ``[reconstruction]`` in flight.toml; `Settings.from_mapping` reads them.
 """

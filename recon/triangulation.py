@@ -1,4 +1,4 @@
-"""Initial positions from angles and ranges of several sites, none of which fixes a position by itself.
+"""Where is the vehicle, by angles and ranges of several sites, none of which fixes a position by itself?
 
 At times of the sites' readings, at most two a second, the others' readings are interpolated where they have some on
 both sides within `_BRIDGED_S`. With three components or more a point is their weighted least-squares solution

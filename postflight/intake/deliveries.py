@@ -467,16 +467,9 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
     came = _Delivery()
     faults: list[str] = []
     lacking: list[str] = []  # libraries that are not installed
-    other: dict[str, Issue] = {}
-    for file in (file for file in files if file.suffix.lower() == ".toml"):
-        try:
-            came.files |= {place: _bytes_of(source) for place, source in vehicle_copies(folder, file).items()}
-            came.vehicles.append(f"vehicle/{file.name}")
-        except ConfigError as no_vehicle:
-            other[file.name] = no_vehicle.faults[0]
-    with_it = {place.name for place in came.files}  # a vehicle's own tables, delivered beside it
-    came.skipped += [fault for name, fault in other.items() if name not in with_it]
-    for file in (file for file in files if file.suffix.lower() != ".toml" and file.name not in with_it):
+    _take_vehicles(came, [file for file in files if file.suffix.lower() == ".toml"], folder)
+    of_vehicle = {place.name for place in came.files}  # its own tables, delivered beside it
+    for file in (file for file in files if file.suffix.lower() != ".toml" and file.name not in of_vehicle):
         video = _video_of(file, folder / "telemetry")
         if video is not None:
             if video.is_film and (fault := start_fault(file)):
@@ -509,6 +502,19 @@ def _delivered(files: tuple[Path, ...], folder: Path) -> _Delivery:
         raise GateError(came.skipped, code="nothing-to-import")
     came.tables = [radiosonde_table(table) or table for table in came.tables]
     return came
+
+
+def _take_vehicles(came: _Delivery, files: list[Path], folder: Path) -> None:
+    """Add vehicle files with their tables; a TOML file that is neither is left out."""
+    other: dict[str, Issue] = {}
+    for file in files:
+        try:
+            came.files |= {place: _bytes_of(source) for place, source in vehicle_copies(folder, file).items()}
+            came.vehicles.append(f"vehicle/{file.name}")
+        except ConfigError as fault:
+            other[file.name] = fault.faults[0]
+    own = {place.name for place in came.files}
+    came.skipped += [fault for name, fault in other.items() if name not in own]
 
 
 def _beside_pictures(folder: Path, video: Video) -> list[Issue]:
