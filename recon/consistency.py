@@ -40,8 +40,10 @@ from scipy.special import ndtri
 from flightmodel.checks import BoolArray, Check, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from recon.ekf import FIT_SPAN_S, ForwardPass, Innovations, Problem, jacobian
+from recon.kalman import ForwardPass, Innovations
+from recon.linearise import jacobian
 from recon.measurements import DECELERATION, RADAR, REST, SLOT_NAMES
+from recon.problem import FIT_SPAN_S, Problem
 from recon.settings import Settings
 from recon.smoother import Smoothed, smoothed_covariance
 from recon.state import KINEMATIC, States, boxminus, unpacked
@@ -309,9 +311,7 @@ def data_sheet_checks(problem: Problem, table: pd.DataFrame, confidence: float) 
     return [v for v in out if v is not None]
 
 
-def physical_checks(
-    problem: Problem, innovations: Innovations, table: pd.DataFrame, radars: Iterable[str]
-) -> list[Check]:
+def physical_checks(problem: Problem, run: ForwardPass, table: pd.DataFrame, radars: Iterable[str]) -> list[Check]:
     """One check for each estimated radar error with physical limits; if it fails, it names correlated errors."""
     out = []
     rows = table.set_index("name")
@@ -326,7 +326,7 @@ def physical_checks(
             estimate, sd = float(rows.estimate[name]), float(rows.sd[name])
             outside = max(low - estimate, estimate - high, 0.0) / sd
             found = f"{name} {estimate:.2g} ± {sd:.2g}"
-            alike = _look_alikes(problem, innovations, number, error.states[0]) if outside > _MOST_OUTSIDE else []
+            alike = _look_alikes(problem, run, number, error.states[0]) if outside > _MOST_OUTSIDE else []
             advice = (
                 f"its readings look alike with {', '.join(alike)}: state these" if alike else "check its correction"
             )
@@ -341,11 +341,11 @@ def physical_checks(
     return out
 
 
-def _look_alikes(problem: Problem, innovations: Innovations, number: int, component: str) -> list[str]:
+def _look_alikes(problem: Problem, run: ForwardPass, number: int, component: str) -> list[str]:
     """Errors of the same radar whose partials, less those of its biases, correlate with this one's, most first."""
-    rows = np.flatnonzero((problem.observed.source == number) & innovations.accepted)
+    rows = np.flatnonzero((problem.observed.source == number) & run.innovations.accepted)
     weight = 1.0 / np.sqrt(problem.observed.variance[rows])  # of components that were not measured zero
-    columns = (innovations.by_error[rows] * weight[:, :, None]).reshape(3 * len(rows), -1)
+    columns = (run.readings.by_error[rows] * weight[:, :, None]).reshape(3 * len(rows), -1)
     names, biases = SLOT_NAMES[RADAR], [0, 1, 2]
     columns = columns - columns[:, biases] @ np.linalg.lstsq(columns[:, biases], columns, rcond=None)[0]
     mine = columns[:, names.index(component)]
@@ -372,7 +372,7 @@ def held_out_table(problem: Problem, run: ForwardPass) -> pd.DataFrame:
     out = []
     for row in rows.tolist():
         k = int(node[row])
-        h = jacobian(run.innovations, slots[problem.observed.source[row]], row, problem.size)
+        h = jacobian(run.readings, slots[problem.observed.source[row]], row, problem.size)
         # the innovation is of the state that the measurements before it at the same node had left
         before = run.filtered.x_minus[k].copy()
         for earlier in range(int(problem.observed.first[k]), row):

@@ -13,8 +13,9 @@ from flightmodel import earth
 from flightmodel.checks import Check, FloatArray
 from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import Telemetry
-from recon.ekf import ForwardPass, Problem
+from recon.kalman import ForwardPass
 from recon.measurements import DECELERATION
+from recon.problem import Problem
 from recon.state import States
 
 _LEAST_QUIET = 20  # readings: a second of them

@@ -48,7 +48,7 @@ from flightmodel.atmosphere import (
 from flightmodel.checks import BoolArray, Check, FloatArray, GateError
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory
-from recon.ekf import Problem
+from recon.problem import Problem
 from recon.propagation import Motion
 from recon.state import KINEMATIC, States, unpacked
 

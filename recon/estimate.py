@@ -10,7 +10,7 @@ Aerodynamics and atmosphere take no part: the answer is inertial, and aerodynami
 flight without inertial sensors is propagated by gravity and drag in the sounding's air instead (`recon.propagation`).
 First passes use thinned data about the filter's own estimate, later ones all data about the smoothed trajectory
 (Gauss-Newton); of ballistic flight with a measured deceleration one pass about the filter's own estimate is all
-(`recon.linearisation`). What an estimate contradicts is changed by `recon.reconstruct`; jumps of the inertial clocks
+(`recon.first_passes`). What an estimate contradicts is changed by `recon.reconstruct`; jumps of the inertial clocks
 and transient offsets of readings, which spoil the filter itself, are screened here.
 
 The answer is of the datum, and of the accelerometer's samples. From the accelerometer (at ``r`` from the datum, body
@@ -42,10 +42,10 @@ from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows
 from recon import (
     consistency,
-    ekf,
     fault_isolation,
+    first_passes,
     imu_screening,
-    linearisation,
+    kalman,
     oscillation,
     smoother,
     survey,
@@ -54,7 +54,6 @@ from recon import (
 )
 from recon.consistency import held_out_table
 from recon.deceleration import deceleration_checks
-from recon.ekf import Problem, with_servo_lag
 from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UnmodelledAcceleration,
@@ -63,9 +62,10 @@ from recon.fault_detection import (
     with_unmodelled,
 )
 from recon.fault_isolation import NO_ADAPTATION, Adaptation, LeftOut
+from recon.first_passes import SpinPhase
 from recon.imu_screening import BridgedSensor
-from recon.linearisation import SpinPhase
 from recon.measurements import DECELERATION
+from recon.problem import Problem, with_servo_lag
 from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
@@ -190,7 +190,7 @@ def estimate(
     checks += consistency.data_sheet_checks(problem, table, settings.check_confidence)
     checks += [] if phase is None else [phase.check()]
     checks += [] if sensors is None else [carried_check(spans)]
-    checks += consistency.physical_checks(problem, run.innovations, table, telemetry.radars)
+    checks += consistency.physical_checks(problem, run, table, telemetry.radars)
     held_out = held_out_table(problem, run)
     checks += consistency.held_out_checks(problem, held_out, settings)
     missed = survey.missed_places(problem, run, reference, mount.arm_body_m, telemetry.places)
@@ -332,7 +332,7 @@ def _oscillation_checks(
 def _screened(
     telemetry: Telemetry,
     problem: Problem,
-    run: ekf.ForwardPass,
+    run: kalman.ForwardPass,
     sensors: InertialSensors | None,
     adaptation: Adaptation,
 ) -> Adaptation:
@@ -394,23 +394,23 @@ def _series(
 
 def _iterate(
     problem: Problem, settings: Settings, report: Progress
-) -> tuple[Problem, ekf.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...], SpinPhase | None]:
+) -> tuple[Problem, kalman.ForwardPass, Smoothed, States, int, tuple[UnmodelledAcceleration, ...], SpinPhase | None]:
     """Problem with servo lag, last forward pass, smoothed errors and states, passes, unmodelled accelerations.
 
     Last, what the phase of a fast spin was chosen from.
     """
     reference, phase = None, None
     found: tuple[UnmodelledAcceleration, ...] = ()
-    passes = 0 if linearisation.needs_no_reference(problem) else settings.passes
+    passes = 0 if first_passes.needs_no_reference(problem) else settings.passes
     if passes > 0:
         report(0.02, "first passes on thinned data")
-        reference, found, phase = linearisation.first_reference(problem, settings)
+        reference, found, phase = first_passes.first_reference(problem, settings)
     most, i = max(1, passes), 0
     while True:
         share = 0.85 / most
         report(0.1 + share * i, f"filter, pass {i + 1}")
         problem = with_servo_lag(problem, reference)
-        run, found = linearisation.follow_track(problem, reference, settings, found)
+        run, found = first_passes.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
         smoothed = smoother.smooth(problem, run)
         kept = np.flatnonzero(problem.kept)
@@ -419,7 +419,7 @@ def _iterate(
         i += 1
         if moved.max() < 0.01 or i == most:
             return problem, run, smoothed, smoothed_states, i, found, phase
-        reference = linearisation.bounded_drivers(problem, smoothed_states)
+        reference = first_passes.bounded_drivers(problem, smoothed_states)
         del run, smoothed  # as large as all else together, and the next pass makes its own
 
 

@@ -46,9 +46,10 @@ import numpy as np
 
 from flightmodel._kernels import inlined, kernel, multiply
 from flightmodel.checks import Check, DivergenceError, FloatArray, IntArray, Issue
-from recon.ekf import ForwardPass, Innovations, Problem
 from recon.imu_screening import TransientOffset
+from recon.kalman import ForwardPass, Innovations
 from recon.measurements import SLOTS
+from recon.problem import Problem
 
 _BIASES = np.array([9, 10, 11, 18, 19, 20])  # columns of the transition: accelerometer, then gyros
 LOG_LIKELIHOOD_LIMIT = np.log(1000.0)  # ratio from which one hypothesis is accepted over the other
@@ -105,15 +106,14 @@ def offset_scores(
     first, last = begin[order].astype(np.int64), end[order].astype(np.int64)
     most = int(((first[:, None] <= first) & (last[:, None] >= first)).sum(axis=0).max())
     some, more = score.copy(), variance.copy()
-    window_scores(
-        run.steps, problem.observed, problem.sources().slot, run.innovations, columns, first, last, most, some, more
-    )
+    passed = run.steps, problem.observed, problem.sources().slot, run.readings, run.innovations
+    window_scores(*passed, columns, first, last, most, some, more)
     score[order], variance[order] = some, more
     return score, variance
 
 
 @kernel
-def window_scores(steps, observed, slots, innovations, columns, begin, end, most, score, variance):
+def window_scores(steps, observed, slots, readings, innovations, columns, begin, end, most, score, variance):
     """Score (w, c) of a constant offset of each of ``columns`` (c,) in the steps ``begin`` to ``end`` of each window.
 
     Windows come by ``end`` downwards; at most ``most`` of them meet. Score and ``variance`` (w, c, c) come as zeros.
@@ -134,11 +134,11 @@ def window_scores(steps, observed, slots, innovations, columns, begin, end, most
                 continue
             slot = slots[observed.source[row]]
             adjoint_update(
-                innovations.by_state[row], innovations.by_error[row], slot, innovations.gain[row],
+                readings.by_state[row], readings.by_error[row], slot, innovations.gain[row],
                 innovations.covariance[row], innovations.residual[row], observed.variance[row], mean, information, rest,
                 scratch,
             )  # fmt: skip
-            count = read_columns(innovations.by_state[row], innovations.by_error[row], slot, column, partials)
+            count = read_columns(readings.by_state[row], readings.by_error[row], slot, column, partials)
             for place in range(most):
                 if active[place] >= 0:
                     cross_over_measurement(cross[place], rest, column, count, moved)

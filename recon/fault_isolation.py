@@ -38,10 +38,10 @@ from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
 from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, beyond_gate, edit_check
-from recon.ekf import Problem
 from recon.imu_screening import TransientOffset
 from recon.measurements import SITES
 from recon.oscillation import Oscillation
+from recon.problem import Problem
 from recon.single_faults import TRIADS, SingleFault, likeliest
 from recon.state import KINEMATIC
 from recon.time_bias import ClockJump, Lag

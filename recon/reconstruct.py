@@ -28,11 +28,11 @@ import pandas as pd
 from flightmodel.checks import Check, GateError, Issue, Progress
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon import ekf, fault_isolation, linearisation, rest, setup, single_faults, survey, tracker_time
-from recon.ekf import Problem
+from recon import fault_isolation, first_passes, kalman, rest, setup, single_faults, survey, tracker_time
 from recon.estimate import TrajectorySolution, bridge_inertial_sensors, estimate, trackers
 from recon.fault_detection import UNMODELLED_CODE
 from recon.fault_isolation import INFLATION, Adaptation
+from recon.problem import Problem
 from recon.settings import Settings
 from recon.single_faults import Single, SingleFault
 from recon.state import States
@@ -317,12 +317,12 @@ def _single_faults(case: Case, solution: TrajectorySolution, report: Progress) -
     try:
         as_stated = _coarse_problem(telemetry, coarse, known)
 
-        def filtered(one: Single) -> tuple[Problem, ekf.ForwardPass, States]:
+        def filtered(one: Single) -> tuple[Problem, kalman.ForwardPass, States]:
             # most hypotheses are of the data as delivered, whose screening and integration take the time
             problem = as_stated if one.telemetry is telemetry else _coarse_problem(one.telemetry, coarse, known)
             problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
-            thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(linearisation.THINNED_STEP_S)
-            return linearisation.converged(thinned, coarse.engine)
+            thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(first_passes.THINNED_STEP_S)
+            return first_passes.converged(thinned, coarse.engine)
 
         stated, _ = single_faults.log_likelihood(*filtered(Single("", "", (), telemetry))[:2])
     except GateError:

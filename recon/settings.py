@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictS
 from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.tables import ordered_spans
 
-COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.ekf` and `recon.smoother`
+COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.kalman` and `recon.smoother`
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # whole ones too, but no text and no true or false
 Whole = Annotated[Number, Field(multiple_of=1.0), AfterValidator(int)]
 Rate = Annotated[Number, Field(ge=0.1, le=1000.0)]
@@ -57,7 +57,7 @@ class Settings:
         iterated until attitudes converge; each pass over all data is linearised about the smoothed trajectory before
         it, and another follows only where one moved the result by more than a hundredth of its standard deviation.
         With 0, a single extended Kalman filter over all data about its own estimate; so is a ballistic flight with a
-        measured deceleration filtered, whatever is set (`recon.linearisation.needs_no_reference`).
+        measured deceleration filtered, whatever is set (`recon.first_passes.needs_no_reference`).
     gate_probability : float
         A measurement is edited where its normalised innovation squared is beyond this chi-square quantile.
     check_confidence : float
@@ -76,7 +76,7 @@ class Settings:
     attitude_sensors : bool
         Whether magnetometer and Sun sensors are measurements too; otherwise they only start and check the attitude.
     engine : str
-        ``"compiled"`` or ``"filterpy"``: the same answer, the second much slower (`recon.ekf`).
+        ``"compiled"`` or ``"filterpy"``: the same answer, the second much slower (`recon.kalman`).
 
     Raises
     ------

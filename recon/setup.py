@@ -27,9 +27,9 @@ from flightmodel.tables import spaced
 from flightmodel.telemetry import AttitudePrior, Start, StatePrior, Telemetry
 from flightmodel.trajectory import nearest_index
 from recon import measurements
-from recon.ekf import FIT_SPAN_S, Problem, observe
 from recon.imu_screening import BridgedSensor
 from recon.measurements import HEIGHT, POSITION, RADAR, RANGE_RATE, VELOCITY, Instrument
+from recon.problem import FIT_SPAN_S, Problem, observe
 from recon.propagation import (
     SAME_INSTANT_S,
     Motion,

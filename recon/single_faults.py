@@ -26,8 +26,9 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.instruments import RadarSite
 from flightmodel.telemetry import Telemetry, TriadRecord
-from recon.ekf import ForwardPass, Problem
+from recon.kalman import ForwardPass
 from recon.oscillation import MIRRORED, ROLL, Oscillation
+from recon.problem import Problem
 from recon.time_bias import Lag
 
 WIDER = 30.0  # times the stated sd: a misaligned or mistimed sensor is some tens of them off

@@ -38,13 +38,15 @@ Automatic Control 14 (1969) 387.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from flightmodel._kernels import inlined, kernel, multiply
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray, IntArray
-from recon.ekf import Filtered, ForwardPass, Innovations, Observed, Problem, Steps, full_step, measured_rows
+from recon.kalman import Filtered, ForwardPass, Innovations
+from recon.linearise import Readings, Steps, full_step, measured_rows
+from recon.problem import Observed, Problem
 from recon.state import KINEMATIC, States, boxplus, packed, unpacked
 
 LEAST_PIVOT = 1e-14  # of a correlation matrix; below it a direction is known exactly
@@ -83,7 +85,7 @@ def smooth(problem: Problem, run: ForwardPass, with_covariance: bool = True) -> 
         Where readings are so far from the flight that what `two_filter` factors is no longer positive definite.
     """
     kept = int(problem.kept.sum()) if with_covariance else 0
-    return _smoothed(problem, run.steps, run.filtered, run.innovations, kept)
+    return _smoothed(problem, run, kept)
 
 
 def smoothed_covariance(problem: Problem, run: ForwardPass, kept: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -95,12 +97,13 @@ def smoothed_covariance(problem: Problem, run: ForwardPass, kept: BoolArray) -> 
     # covariance is kept of errors that the motion depends on: of all, where all are columns
     wide = np.concatenate([phi, np.zeros((*phi.shape[:2], problem.size - phi.shape[2]))], axis=2)
     steps, filtered = run.steps._replace(transition=wide), run.filtered._replace(kept=rows)
-    made = _smoothed(problem, steps, filtered, run.innovations, count)
+    made = _smoothed(problem, replace(run, steps=steps, filtered=filtered), count)
     return made.x, unpacked(made.triangles)
 
 
-def _smoothed(problem: Problem, steps: Steps, filtered: Filtered, innovations: Innovations, kept: int) -> Smoothed:
+def _smoothed(problem: Problem, run: ForwardPass, kept: int) -> Smoothed:
     """Smoothed errors, with moments of as many nodes as are ``kept``; of none where that is 0."""
+    steps, filtered = run.steps, run.filtered
     dense = steps.transition.shape[2]
     triangles, variance = np.empty((kept, dense * (dense + 1) // 2)), np.empty((kept, problem.size))
     considered = KINEMATIC + np.flatnonzero(problem.model.wander.considered)
@@ -110,7 +113,9 @@ def _smoothed(problem: Problem, steps: Steps, filtered: Filtered, innovations: I
         return Smoothed(x, triangles, variance)
     x, slots = filtered.x_minus.copy(), problem.sources().slot
     try:
-        two_filter(steps, filtered, problem.observed, slots, innovations, considered, x, triangles, variance)
+        two_filter(
+            steps, filtered, problem.observed, slots, run.readings, run.innovations, considered, x, triangles, variance
+        )
     except np.linalg.LinAlgError:
         words = "readings contradict the flight beyond what numbers hold. Check their units and signs"
         raise DivergenceError(f"reconstruction: diverged: {words}", "trajectory-diverged") from None
@@ -346,8 +351,8 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def two_filter(
-    steps: Steps, run: Filtered, observed: Observed, slots: IntArray, innovations: Innovations, considered: IntArray,
-    x: FloatArray, triangles: FloatArray, variance: FloatArray,
+    steps: Steps, run: Filtered, observed: Observed, slots: IntArray, readings: Readings, innovations: Innovations,
+    considered: IntArray, x: FloatArray, triangles: FloatArray, variance: FloatArray,
 ) -> None:  # fmt: skip
     """Smooth ``x`` (n, N), which comes as the predicted errors, in place; moments at kept nodes where wanted."""
     n, size = x.shape
@@ -358,7 +363,7 @@ def two_filter(
         for row in reversed(range(first[k], first[k + 1])):
             if not v.accepted[row]:
                 continue
-            used, h = measured_rows(observed, slots, v, row, size)
+            used, h = measured_rows(observed, slots, readings, row, size)
             weight, y = h.T / observed.variance[row, used], v.residual[row, used]
             mean = mean + information @ (v.gain[row][:, used] @ y) + weight @ y
             information = information + weight @ h

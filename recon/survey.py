@@ -27,8 +27,9 @@ from flightmodel.checks import Check, FloatArray, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
-from recon.ekf import ForwardPass, Problem
+from recon.kalman import ForwardPass
 from recon.measurements import SITES
+from recon.problem import Problem
 from recon.settings import Settings
 from recon.smoother import smoothed_covariance
 from recon.state import KINEMATIC, States

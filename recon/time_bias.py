@@ -32,9 +32,10 @@ from flightmodel.checks import BoolArray, Check, FloatArray, Issue
 from flightmodel.statistics import NORMAL_MAD
 from flightmodel.telemetry import TriadRecord
 from flightmodel.trajectory import interpolate_rows
-from recon.ekf import ForwardPass, Problem
 from recon.fault_detection import LOG_LIKELIHOOD_LIMIT, offset_scores
 from recon.imu_screening import BridgedSensor, usual_steps
+from recon.kalman import ForwardPass
+from recon.problem import Problem
 from recon.state import KINEMATIC, States
 
 _WINDOW_S, _STEP_S = 4.0, 0.01  # some periods of the oscillation; a fortieth of one at 2.5 Hz

@@ -24,7 +24,8 @@ from scipy.special import ndtri
 
 from flightmodel.checks import Check, FloatArray, GateError, Issue
 from flightmodel.telemetry import Telemetry
-from recon.ekf import ForwardPass, Problem
+from recon.kalman import ForwardPass
+from recon.problem import Problem
 from recon.single_faults import Single, SingleFault, log_likelihood
 from recon.state import States
 

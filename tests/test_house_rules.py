@@ -14,7 +14,7 @@ SOURCES = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py
 CODE = [p for p in SOURCES if "data" not in p.relative_to(ROOT).parts]
 # a library, and the only files that may import it
 DOORS = {
-    "filterpy": {"recon/ekf.py"},
+    "filterpy": {"recon/kalman.py"},
     "ppigrf": {"flightmodel/geomagnetism_and_sun.py"},
     "erfa": {"flightmodel/earth.py", "flightmodel/geomagnetism_and_sun.py"},
     "numba": {"flightmodel/_kernels.py"},  # elsewhere by its decorators

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.ekf import full_step
+from recon.linearise import full_step
 from recon.smoother import keep_moments
 from recon.state import unpacked
 

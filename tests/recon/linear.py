@@ -1,21 +1,23 @@
 """Linear problems in the filter's block form, taken through the filter's own arithmetic and solved by brute force.
 
-A problem is given by its steps and measurements; nothing of a flight stands behind it. `run` chains the very kernels
-of which `recon.ekf.forward_compiled` consists (or filterpy's filter with `recon.ekf.schmidt_update`), so that the
-smoothers can be run on what comes out.
+A problem is given by its steps and measurements; nothing of a flight stands behind it. `run` takes it through the
+filter of either engine, so that the smoothers can be run on what comes out.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon import ekf, smoother
-from recon.ekf import Filtered, Innovations, Observed, Steps, full_step, make_filter, schmidt_update
+from recon import kalman, smoother
+from recon.kalman import Filtered, Innovations
+from recon.linearise import Readings, Steps, full_step
 from recon.measurements import SLOTS
+from recon.problem import Observed
 from recon.settings import COMPILED
-from recon.state import Wander, packed
+from recon.state import Wander
 from tests.oracles import bryson_frazier, plain_smoother
 
+NO_GATE = np.full(4, np.inf)
 EMPTY = np.full(SLOTS, -1, dtype=np.int64)
 
 
@@ -47,6 +49,10 @@ class Linear:
     def node(self):
         return np.repeat(np.arange(len(self.offset)), np.diff(self.observed.first))
 
+    @property
+    def readings(self):
+        return Readings(self.observed.value, self.by_state, self.by_error)
+
     def jacobian(self, row):
         """Partials (k, N) of the measured components."""
         slot = self.slots[self.observed.source[row]]
@@ -73,80 +79,19 @@ def empty_answer(problem):
     )  # fmt: skip
     return run, Innovations(
         np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.ones(count, dtype=bool),
-        np.zeros((count, size, 3)), problem.by_state.copy(), problem.by_error.copy(),
+        np.zeros((count, size, 3)),
     )  # fmt: skip
 
 
 def run(problem, engine=COMPILED):
-    """One forward pass: `Filtered` and `Innovations`."""
+    """One forward pass without a gate: `Filtered` and `Innovations`."""
     out, innovations = empty_answer(problem)
-    one = _Compiled(problem, out, innovations) if engine == COMPILED else _Filterpy(problem, innovations)
-    for k in range(len(problem.offset)):
-        if k > 0:
-            one.step(k - 1, problem.offset[k])
-        out.x_minus[k], out.p_minus[k] = one.x, packed(one.p)
-        for row in np.flatnonzero(problem.node == k):
-            one.use(row)
-        dense = problem.steps.transition.shape[2]
-        out.x_plus[k], out.p_plus[k] = one.x, packed(one.p[:dense, :dense])
-    out.p_last[:] = one.p
+    steps, every = problem.steps._replace(offset=problem.offset[1:]), (0, len(problem.offset))
+    kalman.ENGINES[engine](
+        problem.observed, problem.slots, problem.wander, NO_GATE, *every, problem.start.copy(), steps, problem.readings,
+        out, innovations,
+    )  # fmt: skip
     return out, innovations
-
-
-class _Compiled:
-    """The kernels that `recon.ekf.forward_compiled` chains."""
-
-    def __init__(self, problem, out, innovations):
-        self.problem, self.innovations = problem, innovations
-        self.x, self.p, self.rows = problem.start.copy(), out.p_last, np.empty((9, len(problem.start)))
-
-    def step(self, j, offset):
-        s, x = self.problem.steps, np.empty_like(self.x)
-        ekf.linear_step(self.x, s.transition[j], s.decay[j], x)
-        self.x = x + offset
-        moving = len(self.problem.moving) > 9
-        ekf.predict_covariance(self.p, s.transition[j], s.noise[j], s.decay[j], s.noise_var[j], moving, self.rows)
-
-    def use(self, row):
-        problem, v = self.problem, self.innovations
-        variance, slot = problem.observed.variance[row], problem.slots[problem.observed.source[row]]
-        used = np.flatnonzero(np.isfinite(variance)).astype(np.int64)
-        y, s, factor = np.zeros(3), np.empty((3, 3)), np.empty((3, 3))
-        w = np.empty((3, len(self.x)))
-        count = len(used)
-        for r, i in enumerate(used):
-            y[r] = problem.observed.value[row, i] - ekf.times(v.by_state[row, i], v.by_error[row, i], slot, self.x)
-        ekf.cross_covariance(self.p, v.by_state[row], v.by_error[row], slot, count, s, used, w)
-        ekf.record(v, row, s, y, used, count, variance)
-        ekf.small_cholesky(s, count, factor)
-        ekf.gain_and_update(
-            self.x, self.p, w, y, factor, count, used, problem.wander.considered, problem.wander.sd, v.gain[row]
-        )
-
-
-class _Filterpy:
-    """Filterpy's filter as the filterpy engine uses it."""
-
-    def __init__(self, problem, innovations):
-        self.problem, self.innovations = problem, innovations
-        self.ekf = make_filter(len(problem.start), problem.start, problem.start_covariance)
-
-    x = property(lambda self: self.ekf.x)
-    p = property(lambda self: self.ekf.P)
-
-    def step(self, j, offset):
-        self.ekf.F, self.ekf.Q = full_step(self.problem.steps, j)
-        self.ekf.predict(u=offset)
-
-    def use(self, row):
-        problem, v = self.problem, self.innovations
-        used = np.flatnonzero(np.isfinite(problem.observed.variance[row]))
-        h, noise = problem.jacobian(row), problem.noise(row)
-        y = problem.value(row) - h @ self.ekf.x
-        s = h @ self.ekf.P @ h.T + noise
-        v.covariance[row] = np.eye(3)
-        v.residual[row, used], v.covariance[row][np.ix_(used, used)] = y, s
-        v.gain[row][:, used] = schmidt_update(self.ekf, y, h, noise, problem.considered)
 
 
 def smooth(problem, out, innovations, method):
@@ -156,12 +101,13 @@ def smooth(problem, out, innovations, method):
     if method == "two-filter":
         x = out.x_minus.copy()
         smoother.two_filter(
-            problem.steps, out, problem.observed, problem.slots, innovations, problem.considered, x, triangles, variance
-        )
+            problem.steps, out, problem.observed, problem.slots, problem.readings, innovations, problem.considered, x,
+            triangles, variance,
+        )  # fmt: skip
     elif method == "bryson-frazier":
         x = np.empty_like(out.x_plus)
         bryson_frazier.bryson_frazier(
-            problem.steps, out, problem.observed, problem.slots, innovations, x, triangles, variance
+            problem.steps, out, problem.observed, problem.slots, problem.readings, innovations, x, triangles, variance
         )
     else:
         x = out.x_plus.copy()
@@ -271,6 +217,6 @@ def random_problem(seed, drivers=18, others=6, nodes=14, considered=(), prior=2.
     by_error[:, :, :13] = rng.normal(0.0, 1.0, (count, 3, 13))  # more than the slots that are taken
     offset = rng.normal(0.0, 1.0, (nodes, size))
     return Linear(
-        Steps(transition, noise, decay, noise_var), wander, observed, slots, by_state, by_error,
+        Steps(transition, noise, decay, noise_var, offset[1:]), wander, observed, slots, by_state, by_error,
         rng.normal(0.0, 1.0, size), p0, offset,
     )  # fmt: skip

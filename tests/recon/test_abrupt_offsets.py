@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from flightmodel.telemetry import TriadRecord
-from recon.ekf import forward
 from recon.estimate import bridge_inertial_sensors, estimate
 from recon.fault_detection import unsupported_offsets, window_scores
 from recon.imu_screening import _REACH, TransientOffset, bridge, repeated_samples, transient_offsets
+from recon.kalman import forward
 from recon.settings import Settings
 from recon.setup import build_problem
 from tests.oracles import bryson_frazier
@@ -178,7 +178,7 @@ def test_scores_are_the_likelihood_of_an_offset(seed):
     problem = linear.random_problem(seed)
     columns = np.array([9, 11, 19])
     _, innovations = linear.run(problem)
-    about = problem.steps, problem.observed, problem.slots, innovations, columns
+    about = problem.steps, problem.observed, problem.slots, problem.readings, innovations, columns
     begin, end = np.array([9, 3, 3, 0]), np.array([13, 8, 5, 2])
     score, variance = np.zeros((4, 3)), np.zeros((4, 3, 3))
     window_scores(*about, begin, end, 3, score, variance)

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from recon.ekf import forward
+from recon.kalman import forward
 from recon.settings import ENGINES
 from recon.smoother import smooth
 from recon.state import unpacked

@@ -15,8 +15,10 @@ import pandas as pd
 import pytest
 
 from flightmodel import earth
-from recon.ekf import Observed, Problem, Steps, forward, observe
+from recon.kalman import forward
+from recon.linearise import Steps
 from recon.measurements import HEIGHT, SLOTS, Instrument
+from recon.problem import Observed, Problem, observe
 from recon.propagation import propagate, strapdown_motion
 from recon.settings import ENGINES
 from recon.smoother import smooth
@@ -166,7 +168,7 @@ def trend_problem(series, mean, covariance):
     start[:2], p[:2, :2] = mean, covariance
     forever = np.full(6, np.inf)
     wander = Wander(forever, forever, np.ones(6), np.zeros(6), np.zeros(6, dtype=bool))
-    steps = Steps(transition, noise, flat, 0.0 * flat)
+    steps = Steps(transition, noise, flat, 0.0 * flat, np.zeros((count - 1, size)))
     by_error = np.zeros((len(there), 3, SLOTS))
     slots = np.full((1, SLOTS), -1, dtype=np.int64)
     return linear.Linear(steps, wander, observed, slots, by_state, by_error, start, p, np.zeros((count, size)))

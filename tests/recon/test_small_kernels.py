@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flightmodel import earth, rotations
-from recon import ekf, propagation
+from recon import kalman, linearise, propagation
 from recon.fault_detection import window_scores
 from recon.propagation import correct, propagate, strapdown_motion, with_exact_integrals
 from recon.settings import ENGINES, FILTERPY
@@ -56,11 +56,10 @@ def test_glr_scores_are_those_of_the_numpy_form():
     columns = np.array([9, 10, 12])
     begin, end = np.array([7, 2], dtype=np.int64), np.array([11, 9], dtype=np.int64)
     score, variance = np.zeros((2, 3)), np.zeros((2, 3, 3))
-    window_scores(problem.steps, problem.observed, problem.slots, innovations, columns, begin, end, 2, score, variance)
+    about = problem.steps, problem.observed, problem.slots, problem.readings, innovations, columns
+    window_scores(*about, begin, end, 2, score, variance)
     for k in range(2):
-        s, v = bryson_frazier.offset_scores(
-            problem.steps, problem.observed, problem.slots, innovations, columns, int(begin[k]), int(end[k])
-        )
+        s, v = bryson_frazier.offset_scores(*about, int(begin[k]), int(end[k]))
         np.testing.assert_allclose(score[k], s, rtol=1e-8)
         np.testing.assert_allclose(variance[k], v, rtol=1e-8, atol=1e-9 * np.abs(v).max())
 
@@ -70,7 +69,7 @@ def test_chart_turns_with_the_right_jacobian():
     d, step = np.array([0.06, -0.08, 0.03]), 1e-5
     phi = np.zeros((9, 9))
     phi[6:9, 6:9] = np.eye(3)
-    ekf.right_jacobian_columns(phi, *d)
+    linearise.right_jacobian_columns(phi, *d)
     reference = rotations.exp(d)
     for j in range(3):
         e = step * np.eye(3)[j]
@@ -90,7 +89,7 @@ def test_wander_keeps_its_stated_size():
     wander = Wander(tau, length, sd, walk, np.zeros(4, dtype=bool))
     decay, new = np.empty(4), np.empty(4)
     for dt, climb in ((0.5, 30.0), (7.0, 900.0)):
-        assert ekf.decay_and_noise(wander, dt, climb, decay, new)
+        linearise.decay_and_noise(wander, dt, climb, decay, new)
         forgets = [0, 1, 3]
         np.testing.assert_allclose((decay**2 * sd**2 + new)[forgets], sd[forgets] ** 2, rtol=1e-12)
         np.testing.assert_allclose(-np.log(decay[forgets]), (dt / tau + climb / length)[forgets], rtol=1e-12)
@@ -234,8 +233,8 @@ SHORT = {"start_s": None, "end_s": 6.1, "output_rate_hz": 1.0}  # six seconds ar
 def test_a_short_fall_is_filtered_alike_by_both_engines_whatever_turn_the_azimuth_is_on():
     telemetry = far_off(short_fall(), [3], 900.0)
     problem = build(telemetry, **SHORT)
-    plain = ekf.forward(problem, None, FILTERPY)
-    run = ekf.forward(build(turned_round(telemetry, 1), **SHORT))
+    plain = kalman.forward(problem, None, FILTERPY)
+    run = kalman.forward(build(turned_round(telemetry, 1), **SHORT))
     assert np.array_equal(run.innovations.accepted, plain.innovations.accepted)
     sd = np.sqrt(np.diagonal(unpacked(plain.filtered.p_minus), axis1=1, axis2=2))
     assert (np.abs(run.filtered.x_plus - plain.filtered.x_plus) / sd).max() < 1e-6

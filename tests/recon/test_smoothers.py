@@ -7,7 +7,8 @@ import pytest
 
 from flightmodel.instruments import GnssSpec
 from recon import fault_detection, smoother
-from recon.ekf import forward, full_step
+from recon.kalman import forward
+from recon.linearise import full_step
 from recon.settings import ENGINES
 from recon.smoother import smooth
 from recon.state import unpacked
@@ -150,8 +151,8 @@ def test_two_filters_equal_the_others_where_nothing_is_considered(flights, name)
     x, count = run.filtered.x_minus.copy(), int(problem.kept.sum())
     triangles, variance = np.empty((count, problem.dense * (problem.dense + 1) // 2)), np.empty((count, problem.size))
     smoother.two_filter(
-        run.steps, run.filtered, problem.observed, problem.sources().slot, run.innovations, np.empty(0, dtype=np.int64),
-        x, triangles, variance,
+        run.steps, run.filtered, problem.observed, problem.sources().slot, run.readings, run.innovations,
+        np.empty(0, dtype=np.int64), x, triangles, variance,
     )  # fmt: skip
     other = smooth(problem, run)
     assert (np.abs(other.x - x)[problem.kept] / np.sqrt(other.variance)).max() < 1e-8
@@ -178,7 +179,9 @@ def test_adjoint_keeps_its_digits_after_precise_points(mini_sense, mini_truth):
     begin, end = np.array([0]), np.array([len(problem.time_s) - 1])
     score, variance = fault_detection.offset_scores(problem, run, begin, end)
     slots, columns = problem.sources().slot, fault_detection._BIASES
-    s, v = bryson_frazier.offset_scores(run.steps, problem.observed, slots, run.innovations, columns, 0, end[0])
+    s, v = bryson_frazier.offset_scores(
+        run.steps, problem.observed, slots, run.readings, run.innovations, columns, 0, end[0]
+    )
     sd = np.sqrt(np.diagonal(v))
     assert (np.abs(score[0] - s) / sd).max() < 1e-3
     assert (np.abs(variance[0] - v) / np.outer(sd, sd)).max() < 1e-3

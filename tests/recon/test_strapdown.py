@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from flightmodel import earth, rotations
-from recon import ekf
+from recon import kalman
 from recon.propagation import correct, correction_partials, fill_between, propagate, strapdown_motion
 from recon.state import States, boxminus, boxplus
 from tests.oracles import strapdown as plain_strapdown
@@ -203,9 +203,9 @@ def test_nodes_between_known_ones_are_carried_from_them(grid, state):
 
 def test_steps_of_a_pass_along_a_reference_are_single_propagations(mini_sense):
     problem = build(mini_sense(1)[0], end_s=108.0)
-    first = ekf.forward(problem)
+    first = kalman.forward(problem)
     reference = first.states()
-    run = ekf.forward(problem, reference)
+    run = kalman.forward(problem, reference)
     for k in range(0, len(problem.time_s) - 1, 7):
         one = propagate(problem.motion, problem.node_index[k], problem.node_index[k + 1], reference[k])
         # one kernel inlined in another: fused multiply-adds differ by rounding

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from flightmodel.telemetry import RadarRecord
 from flightmodel.trajectory import difference, nearest_index
-from recon.ekf import observe
+from recon.problem import observe
 from recon.propagation import SAME_INSTANT_S
 from recon.reconstruct import reconstruct
 from recon.settings import Settings

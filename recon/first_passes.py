@@ -30,10 +30,10 @@ from typing import NamedTuple
 import numpy as np
 
 from flightmodel.checks import Check, FloatArray, IntArray
-from recon import ekf, propagation, setup, single_faults, smoother
-from recon.ekf import Problem, with_servo_lag
+from recon import kalman, propagation, setup, single_faults, smoother
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 from recon.measurements import DECELERATION
+from recon.problem import Problem, with_servo_lag
 from recon.settings import Settings
 from recon.state import KINEMATIC, ROTATION, States, boxplus, unpacked
 
@@ -89,10 +89,10 @@ class Start(NamedTuple):
 
 def follow_track(
     problem: Problem, reference: States | None, settings: Settings, found: tuple[UnmodelledAcceleration, ...]
-) -> tuple[ekf.ForwardPass, tuple[UnmodelledAcceleration, ...]]:
+) -> tuple[kalman.ForwardPass, tuple[UnmodelledAcceleration, ...]]:
     """Forward pass with as many spans of unmodelled acceleration as it takes to follow the track, and these."""
     while True:
-        run = ekf.forward(with_unmodelled(problem, found), reference, settings.engine)
+        run = kalman.forward(with_unmodelled(problem, found), reference, settings.engine)
         more = with_one_more(found, problem, run)
         if more is None:
             return run, found
@@ -123,21 +123,21 @@ def bounded_drivers(problem: Problem, states: States) -> States:
     return replace(states, sensor_errors=errors)
 
 
-Forward = Callable[[Problem, States | None], tuple[ekf.ForwardPass, States | None]]
+Forward = Callable[[Problem, States | None], tuple[kalman.ForwardPass, States | None]]
 
 
 def converged(
     thinned: Problem, engine: str, reference: States | None = None, forward: Forward | None = None
-) -> tuple[Problem, ekf.ForwardPass, States]:
+) -> tuple[Problem, kalman.ForwardPass, States]:
     """Thinned problem with its radars' lag, last forward pass and states to linearise about, rotations converged.
 
     From the filter's own estimate on, or from a reference. ``forward`` makes a pass about one and says about which, as
-    `ekf.forward` does by itself; then one that the first pass does not move is the answer.
+    `kalman.forward` does by itself; then one that the first pass does not move is the answer.
     """
     for k in range(6):  # the passes with all points go on from there
         thinned = with_servo_lag(thinned, reference)
         if forward is None:
-            run = ekf.forward(thinned, reference, engine)
+            run = kalman.forward(thinned, reference, engine)
         else:
             run, reference = forward(thinned, reference)
         smoothed = smoother.smooth(thinned, run, with_covariance=False)
@@ -156,7 +156,7 @@ def first_reference(problem: Problem, settings: Settings) -> Start:
     reference, phase = _chosen_phase(thinned, settings.engine)
     found: tuple[UnmodelledAcceleration, ...] = ()
 
-    def following(part: Problem, about: States | None) -> tuple[ekf.ForwardPass, States | None]:
+    def following(part: Problem, about: States | None) -> tuple[kalman.ForwardPass, States | None]:
         nonlocal found
         run, found = follow_track(part, about, settings, found)
         if about is None and problem.motion.ballistic and track_is_lost(part, run):
@@ -242,7 +242,7 @@ def _phase_by_gyros(thinned: Problem, engine: str) -> FloatArray | None:
     scale_sd = np.sqrt(np.diag(thinned.start_covariance)[_GYROS][3:6].max())
     if 0.5 * np.diff(t) @ (rate[1:] + rate[:-1]) * scale_sd < _FOLLOWED_RAD:
         return None
-    free = ekf.forward(thinned.without(np.ones(len(thinned.row), dtype=bool)), None, engine).filtered
+    free = kalman.forward(thinned.without(np.ones(len(thinned.row), dtype=bool)), None, engine).filtered
     diagonal = [r * (r + 1) // 2 + r for r in range(*ROTATION.indices(KINEMATIC))]
     covariance = unpacked(free.p_minus[int(np.argmax(free.p_minus[:, diagonal].max(axis=1)))])
     _, axes = np.linalg.eigh(covariance[ROTATION, ROTATION])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flightmodel.trajectory import difference
-from recon import linearisation, propagation
+from recon import first_passes, propagation
 from recon.estimate import estimate
-from recon.linearisation import SpinPhase
+from recon.first_passes import SpinPhase
 from recon.settings import Settings
 
 SCALE_SD = 0.1  # of a vehicle that turns six times: an angle of 1.9 rad at the peak of the force
@@ -60,7 +60,7 @@ def test_a_long_flight_s_coarse_parts_lead_to_the_same_phase(mini_sense, monkeyp
     telemetry = with_scale(mini_sense(5)[0], 0.15)
     fine = estimate(telemetry, SETTINGS)
     assert not nodes
-    monkeypatch.setattr(linearisation, "_COARSE_NODES", 40)
+    monkeypatch.setattr(first_passes, "_COARSE_NODES", 40)
     coarse = estimate(telemetry, SETTINGS)
     ((few, whole, kept),) = nodes
     assert few < 60
@@ -74,7 +74,7 @@ def test_a_long_flight_s_coarse_parts_lead_to_the_same_phase(mini_sense, monkeyp
 
 def test_of_parts_that_came_to_one_phase_one_is_compared():
     found = [(-10.0, 4.1, "a"), (-10.2, 4.8, "b"), (-12.0, 21.3, "c"), (-9.0, 3.9, "d"), (-50.0, -5.0, "far off")]
-    assert linearisation._likely(found) == ["d", "c"]
+    assert first_passes._likely(found) == ["d", "c"]
 
 
 def test_decimated_motion_keeps_nodes_integrals_and_noise():
@@ -100,7 +100,7 @@ def test_decimated_motion_keeps_nodes_integrals_and_noise():
 
 
 def test_without_the_parts_the_filter_takes_another_phase(mini_sense, mini_truth, monkeypatch):
-    monkeypatch.setattr(linearisation, "_chosen_phase", lambda _problem, _engine: (None, None))
+    monkeypatch.setattr(first_passes, "_chosen_phase", lambda _problem, _engine: (None, None))
     solution = estimate(with_scale(mini_sense(5)[0], 0.23), SETTINGS)
     error, square = errors_of(mini_truth, solution)
     assert np.abs(error).max() > np.deg2rad(30.0) or np.median(square) > 60.0
