@@ -9,10 +9,12 @@ Of unknowns ``x``, residuals ``r = measured - predicted(x)`` with derivatives ``
 - *Robust*: Huber's ``rho`` is quadratic up to a limit and straight beyond it. ``W`` then holds ``w h`` with the factor
   ``h = min(1, limit / |r|)`` of the point (iteratively reweighted least squares), for which ``rho = h (2 - h) r^2``.
 - *Damping*: none at first. A step that does not lower the cost is tried again with `FIRST_DAMPING`, then with ten times
-  as much, and so on; a step that does divides the damping by ten, and by less than the first there is none.
-- *Stop*: an undamped step that is shorter than ``settled_sd`` in its own standard deviations, of all unknowns together:
-  ``step^T N step < settled_sd^2``. No unknown, and no combination of them, then moves by more of its sd. This last step
-  is taken, and the problem stays as it was linearised before it.
+  as much, and so on; one that does divides the damping by ten, and below the first there is none.
+- *Stop*: a step that is shorter than ``settled_sd`` in its own standard deviations, of all unknowns together,
+  ``step^T (J^T W r - M (x - m)) < settled_sd^2``. Undamped, no unknown and no combination of them then moves by more of
+  its sd. A damped one counts if the undamped one and all between do not lower the cost: that is lowest in a kink of the
+  model, as tables have them, whatever its slopes promise. The last step is taken, and the problem stays as it was
+  linearised before it.
 - *Covariance*: ``N^-1`` at the end.
 
 ``N`` is an `Arrow`: of many unknowns that follow each other in time its band is sparse, of a few it is the corner.
@@ -27,6 +29,7 @@ Determination", 2004, chapter 4 (a priori information).
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -49,7 +52,7 @@ class Linearised:
     right : (n,) float
         Right-hand side of a step from the point.
     cost : float
-        At the point.
+        At the point; infinite where anything is not finite.
     residual : (m,) float
         Measured minus predicted, unweighted.
     """
@@ -90,12 +93,19 @@ class Linearised:
         cost = float(np.sum(weight * robust * (2.0 - robust) * residual**2) + np.sum(off_prior * pull))
         corner = np.asarray(weighted @ jacobian + information)
         matrix = Arrow(np.zeros((1, 0)), np.zeros((0, len(corner))), corner)
-        return cls(matrix, weighted @ residual - pull, cost if np.isfinite(cost) else np.inf, residual)
+        return cls(matrix, weighted @ residual - pull, cost if np.isfinite(cost + corner.sum()) else np.inf, residual)
 
     @cached_property
     def factor(self) -> ArrowFactor:
         """Cholesky factor; `numpy.linalg.LinAlgError` where the measurements do not determine all unknowns."""
         return self.matrix.factor()
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether there is a factor."""
+        with suppress(np.linalg.LinAlgError):
+            return bool(self.factor)
+        return False
 
     @property
     def covariance(self) -> FloatArray:
@@ -120,7 +130,7 @@ class Estimate:
     linear : Linearised
         The problem at the solution.
     converged : bool
-        Whether the last step was as short as was asked for.
+        Whether the last step was as short as was asked for, and all unknowns are determined.
     steps : int
         Steps that were tried.
     """
@@ -142,7 +152,7 @@ class Estimate:
 
 
 def least_squares(
-    linearised: Callable[[FloatArray], Linearised], start: FloatArray, settled_sd: float, most_steps: int = 50
+    linearised: Callable[[FloatArray], Linearised], start: FloatArray, settled_sd: float, most_steps: int = 100
 ) -> Estimate:
     """Values of the lowest cost, from a start near enough.
 
@@ -156,21 +166,23 @@ def least_squares(
     most_steps : int
         Tried, damped ones included.
     """
-    value, here, damping = start, linearised(start), 0.0
-    for steps in range(1, most_steps + 1):
-        try:
-            step = here.step(damping)
-        except np.linalg.LinAlgError:  # some combination of unknowns is not determined here
-            damping = max(10.0 * damping, FIRST_DAMPING)
+    value, here, damping, least, steps = start, linearised(start), 0.0, np.inf, 0
+    while steps < most_steps and np.isfinite(here.cost):
+        floor = 0.0 if here.is_determined else FIRST_DAMPING
+        damping = max(damping, floor)
+        least = min(least, damping)  # that was tried from this point
+        step, steps = here.step(damping), steps + 1
+        if here.right @ step < settled_sd**2:
+            if least == floor:
+                return Estimate(value + step, here, here.is_determined, steps)
+            damping = 0.0
             continue
-        if not damping and here.right @ step < settled_sd**2:
-            return Estimate(value + step, here, True, steps)
         there = linearised(value + step)
         if there.cost <= here.cost:
-            value, here, damping = value + step, there, 0.1 * damping if damping > FIRST_DAMPING else 0.0
+            value, here, damping, least = value + step, there, 0.1 * damping if damping > FIRST_DAMPING else 0.0, np.inf
         else:
             damping = max(10.0 * damping, FIRST_DAMPING)
-    return Estimate(value, here, False, most_steps)
+    return Estimate(value, here, False, steps)
 
 
 def huber_factor(residual_sd: FloatArray, limit_sd: float) -> FloatArray:

@@ -109,7 +109,6 @@ def test_what_does_not_converge_says_so():
     # no minimum at all: the cost falls for ever
     falling = least_squares(lambda x: Linearised.of(2.0 + np.exp(-x), np.exp(-x)[:, None]), np.zeros(1), 1e-9)
     assert not falling.converged
-    assert falling.steps == 50
     # readings that depend on one combination alone, and none that is a number
     blind = fitted(read, information=0.0, mean=0.0)
     assert blind.converged
