@@ -213,14 +213,6 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
 
 
 @inlined
-def turn_columns(columns, first, turned):
-    """Columns (n, q) as rows from ``first`` on."""
-    for i in range(len(columns)):
-        for j in range(columns.shape[1]):
-            turned[first + j, i] = columns[i, j]
-
-
-@inlined
 def lower_products(columns, count, weight, first, weighted, product):
     """Lower triangle, from row ``first``, of the weighted products of the points' columns, stored as rows (q, n).
 
