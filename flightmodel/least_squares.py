@@ -8,8 +8,9 @@ Of unknowns ``x``, residuals ``r = measured - predicted(x)`` with derivatives ``
 
 - *Robust*: Huber's ``rho`` is quadratic up to a limit and straight beyond it. ``W`` then holds ``w h`` with the factor
   ``h = min(1, limit / |r|)`` of the point (iteratively reweighted least squares), for which ``rho = h (2 - h) r^2``.
-- *Damping*: none at first. A step that does not lower the cost is tried again with `FIRST_DAMPING`, then with ten times
-  as much, and so on; one that does divides the damping by ten, and below the first there is none.
+- *Damping*: none at first. A step is taken if it lowers the cost. If it lowers it by less than a quarter of what the
+  linear problem promises, the next one has `FIRST_DAMPING`, then ten times as much, and so on; if by more than three
+  quarters, a tenth, and below the first none.
 - *Stop*: a step that is shorter than ``settled_sd`` in its own standard deviations, of all unknowns together,
   ``step^T (J^T W r - M (x - m)) < settled_sd^2``. Undamped, no unknown and no combination of them then moves by more of
   its sd. A damped one counts if the undamped one and all between do not lower the cost: that is lowest in a kink of the
@@ -172,16 +173,20 @@ def least_squares(
         damping = max(damping, floor)
         least = min(least, damping)  # that was tried from this point
         step, steps = here.step(damping), steps + 1
-        if here.right @ step < settled_sd**2:
+        promised = float(here.right @ step)
+        if promised < settled_sd**2:
             if least == floor:
                 return Estimate(value + step, here, here.is_determined, steps)
             damping = 0.0
             continue
         there = linearised(value + step)
-        if there.cost <= here.cost:
-            value, here, damping, least = value + step, there, 0.1 * damping if damping > FIRST_DAMPING else 0.0, np.inf
-        else:
+        share = (here.cost - there.cost) / promised
+        if share >= 0.0:
+            value, here, least = value + step, there, np.inf
+        if share < 0.25:
             damping = max(10.0 * damping, FIRST_DAMPING)
+        elif share > 0.75:
+            damping = 0.1 * damping if damping > FIRST_DAMPING else 0.0
     return Estimate(value, here, False, steps)
 
 
