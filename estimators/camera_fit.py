@@ -58,13 +58,12 @@ from estimators.frame_solution import (
     found_rows,
     least_points,
     refused_fit,
-    solved_step,
-    used_points,
 )
 from estimators.texture import PaintedTexture
-from estimators.virtual_camera import COLUMNS, DEFLECTION, VirtualCamera
+from estimators.virtual_camera import COLUMNS, DEFLECTION, FLATTENING, JOINT, VirtualCamera
 from flightmodel.checks import NO_FAULT, BoolArray, FloatArray, Issue
 from flightmodel.deflection import lv_clock
+from flightmodel.least_squares import Linearised
 from flightmodel.statistics import NORMAL_MAD
 
 Image = NDArray[np.uint8]
@@ -324,35 +323,29 @@ class OrientedCamera:
     ) -> Solution:  # fmt: skip
         """Fit as `_fit_points`, with its covariance; `NoFitError` where the residuals are too large."""
         k = basis.shape[1]
-        _, sd = prior = prior or self._shape_prior(k)
+        prior = prior or self._shape_prior(k)
         found = self._fit_points(horizon, place, deformation, basis, prior)
-        n, width = len(found.weight), k + len(sd)
-        columns, at, rows = np.empty((n, width)), np.empty(n, dtype=np.intp), np.empty((n, found.rows.shape[1]))
-        residual, weight = np.empty((2, n))
-        count, square = used_points(
-            np.ascontiguousarray(basis), found.rows, found.shape, found.residual_px, found.left_px, found.weight,
-            columns, (at, rows, residual, weight),
-        )  # fmt: skip
+        at = np.flatnonzero(found.weight > 0.0)
         least = min(least_points(horizon), LEAST_FEATURES)
-        if count < least:
+        if len(at) < least:
             raise NoFitError(
-                f"{count} edge points and features agree with one deflection where {least} are needed",
+                f"{len(at)} edge points and features agree with one deflection where {least} are needed",
                 "edge-points-too-few",
             )
-        rms = float(np.sqrt(square))
+        rows, residual, weight = found.rows[at], found.residual_px[at], found.weight[at]
+        rms = float(np.sqrt(weight @ found.left_px[at] ** 2 / weight.sum()))
         if rms > worst_rms_px:
             raise NoFitError(
                 f"the edge is not the shell's: rms {rms:.1f} px where {worst_rms_px} px are allowed", "edge-not-shell"
             )
-        columns, at, rows = columns[:count], at[:count], rows[:count]
-        residual, weight = residual[:count], weight[:count]
-        formal, step = np.empty((width, width)), np.empty(width)
-        solved_step(columns, residual, weight, prior, float(deformation[2]), formal, step)
+        columns = np.column_stack([rows[:, DEFLECTION] @ basis, rows[:, FLATTENING], rows[:, JOINT], found.shape[at]])
+        last = _last_step(columns, residual, weight, prior, float(deformation[2]))
         before = self.benchmark_residuals.rows[found.benchmark_at[at]]
         edge_count = int(np.searchsorted(at, found.edge_points))
         # the flattening's value was carried from step to step, the others are counted from zero in each
-        shape_found = step[k:]
+        shape_found = last.step()[k:]
         shape_found[0] += deformation[2]
+        formal = last.covariance
         return Solution(
             (formal @ columns.T) * weight,
             formal,
@@ -375,10 +368,10 @@ class OrientedCamera:
 
     def _edge_step(self, both: Solution, flattening_rad: float) -> tuple[FloatArray, Solution]:
         """One step (2,) from an answer of edge and features to that of the edge alone, and its gain and covariance."""
-        edge, (mean, sd) = slice(0, both.edge_count), self._prior_about(both)
+        edge = slice(0, both.edge_count)
         design, weight = both.columns[edge], both.weight[edge]
-        formal, step = np.empty_like(both.formal), np.empty(len(both.formal))
-        solved_step(design, both.residual_px[edge], weight, (mean, sd), flattening_rad, formal, step)
+        last = _last_step(design, both.residual_px[edge], weight, self._prior_about(both), flattening_rad)
+        step, formal = last.step(), last.covariance
         # features that contradict the edge leave it residuals that are none of its scatter
         left = both.residual_px[edge] - design @ step
         scatter = float(weight @ left**2) / max(float(weight @ both.residual_px[edge] ** 2), 1e-12)
@@ -862,6 +855,23 @@ class OrientedCamera:
         self._solve(far, None, moved, np.eye(2), _WORST_RMS_PX)
         deformation[:] = moved
         return self.coherent_edge(frame, deformation)
+
+
+def _last_step(
+    columns: FloatArray, residual: FloatArray, weight: FloatArray, prior: tuple[FloatArray, FloatArray],
+    flattening_rad: float,
+) -> Linearised:  # fmt: skip
+    """Last step of a fit, of deflection, flattening, joint, lobes and light, with the prior of all but the deflection.
+
+    The flattening comes on top of what it was before, the others are counted from zero.
+    """
+    mean, sd = prior
+    free = columns.shape[1] - len(sd)
+    information, off = np.zeros((columns.shape[1],) * 2), np.zeros(columns.shape[1])
+    np.fill_diagonal(information[free:, free:], sd**-2.0)
+    off[free:] = -mean
+    off[free] += flattening_rad
+    return Linearised.of(residual, columns, weight, information, off)
 
 
 def _at_least(matrix: FloatArray, least: float) -> FloatArray:

@@ -19,14 +19,11 @@ Assumed: the camera is fixed to the centerbody, its lens too. Edge points alone 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from estimators.frame_residuals import lower_products, turn_columns
-from flightmodel._kernels import inlined, kernel
 from flightmodel.checks import NO_FAULT, FloatArray, Issue
 
 USUAL_RMS_PX = 1.0  # of edge and features in a frame that is not suspicious
@@ -39,86 +36,6 @@ _WORST_TOGETHER = 72.0  # of the thirty-three of shape, turn and warp
 # sd of a half's deflection by shapes that are not modelled and points that err alike: with it the chi-square of two is
 # 1.5 at the most in 216 fits of sound frames, 8.6 in some of another renderer's, 8 to 90 in frames of which rows slip
 _HALF_RAD = float(np.deg2rad(0.02))
-_ROUNDING = float(np.finfo(float).eps)
-_SWEEPS = 30  # a bound: the angles fall as their squares
-
-
-@inlined
-def turned_to_axes(matrix, axes):
-    """Turn a symmetric matrix (m, m) to its axes, the columns of ``axes``, in place (C. G. J. Jacobi, 1846)."""
-    m = len(matrix)
-    for a in range(m):
-        for b in range(m):
-            axes[a, b] = 1.0 if a == b else 0.0
-    for _ in range(_SWEEPS):
-        is_diagonal = True
-        for a in range(m):
-            for b in range(a + 1, m):
-                off = matrix[a, b]
-                if off * off <= 1e-32 * abs(matrix[a, a] * matrix[b, b]):
-                    continue
-                is_diagonal = False
-                half = 0.5 * (matrix[b, b] - matrix[a, a]) / off
-                t = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
-                for j in range(m):
-                    x, y = matrix[a, j], matrix[b, j]
-                    matrix[a, j], matrix[b, j] = c * x - s * y, s * x + c * y
-                for j in range(m):
-                    x, y = matrix[j, a], matrix[j, b]
-                    matrix[j, a], matrix[j, b] = c * x - s * y, s * x + c * y
-                    x, y = axes[j, a], axes[j, b]
-                    axes[j, a], axes[j, b] = c * x - s * y, s * x + c * y
-                matrix[a, b] = matrix[b, a] = 0.0
-        if is_diagonal:
-            break
-
-
-@kernel
-def motion_beside(columns, formal, by, residual, weight, allowed, motion):
-    """Motion (m,) beside a fit that explains the residuals best, and its chi-square.
-
-    ``columns`` (n, k), ``formal`` (k, k): the fit's. ``by`` (n, m): derivatives by the motion. ``allowed``: sd of each
-    of its terms.
-    """
-    (n, k), m = columns.shape, by.shape[1]
-    turned, product = np.empty((k + m + 1, n)), np.empty((k + m + 1, k + m + 1))
-    turn_columns(columns, 0, turned)
-    turn_columns(by, k, turned)
-    for i in range(n):
-        turned[k + m, i] = residual[i]
-    lower_products(turned, n, weight, k, np.empty(n), product)
-    inverse, axes, right = np.empty((m, m)), np.empty((m, m)), np.empty(m)
-    fitted = np.empty(k)
-    for c in range(m + 1):
-        for a in range(k):
-            fitted[a] = 0.0
-            for b in range(k):
-                fitted[a] += formal[a, b] * product[k + c, b]
-        for j in range(min(c + 1, m)):
-            left = product[k + c, k + j]
-            for a in range(k):
-                left -= product[k + j, a] * fitted[a]
-            if c < m:
-                inverse[c, j] = inverse[j, c] = left
-            else:
-                right[j] = left
-    turned_to_axes(inverse, axes)
-    most, square = 0.0, 0.0
-    for q in range(m):
-        motion[q] = 0.0
-        most = max(most, inverse[q, q])
-    for q in range(m):
-        value, along = inverse[q, q], 0.0
-        # along the axes of the inverse covariance, where it says anything
-        if value > m * _ROUNDING * most:
-            for j in range(m):
-                along += axes[j, q] * right[j]
-            for j in range(m):
-                motion[j] += axes[j, q] * along / value
-            square += along * along / (value * (1.0 + allowed * allowed * value))
-    return square
 
 
 @dataclass(frozen=True)
@@ -195,11 +112,14 @@ class Design:
 
         ``allowed``: sd that unmodelled lobes lend to each of its terms.
         """
-        motion = np.empty(by.shape[1])
-        square = motion_beside(
-            self.columns, self.formal, np.ascontiguousarray(by), self.residual_px, self.weight, allowed, motion
-        )  # fmt: skip
-        return motion, square
+        turned = by.T * self.weight
+        crossed = turned @ self.columns
+        fitted = crossed @ self.formal
+        value, axes = np.linalg.eigh(turned @ by - fitted @ crossed.T)
+        along = (turned @ self.residual_px - fitted @ (self.columns.T @ (self.weight * self.residual_px))) @ axes
+        seen = value > len(value) * np.finfo(float).eps * value[-1]  # along the others no point moves
+        along, value = along[seen], value[seen]
+        return axes[:, seen] @ (along / value), float(np.sum(along**2 / (value * (1.0 + allowed**2 * value))))
 
 
 def fault_of_fit(design: Design, rms_px: float, shape: FloatArray, lobes_rad: float) -> tuple[Issue, float]:

@@ -24,6 +24,7 @@ from estimators.virtual_camera import FLATTENING, RADIUS, VirtualCamera
 from flightmodel._kernels import inlined
 from flightmodel.checks import BoolArray, FloatArray
 from flightmodel.deflection import lv_clock
+from flightmodel.least_squares import Linearised, huber_factor
 from flightmodel.statistics import NORMAL_MAD
 
 HUBER = 2.5  # of the scatter: 1 % of normal residuals are beyond it
@@ -174,10 +175,10 @@ def huber_gain(
         if group.any():
             centre = np.median(residual[group])
             scale[group] *= max(NORMAL_MAD * float(np.median(np.abs(residual[group] - centre) / scale[group])), 1.0)
-    weight = 1.0 / scale**2 / np.maximum(1.0, np.abs(residual) / (HUBER * scale)) / together
-    weighted = design.T * weight
-    covariance: FloatArray = np.linalg.inv(weighted @ design + information).astype(float)
-    return covariance @ weighted, covariance, float(np.sqrt(np.average(residual**2, weights=weight)))
+    weight, robust = 1.0 / (scale**2 * together), huber_factor(residual / scale, HUBER)
+    covariance = Linearised.of(residual, design, weight, information, robust=robust).covariance
+    rms_px = float(np.sqrt(np.average(residual**2, weights=weight * robust)))
+    return covariance @ (design.T * (weight * robust)), covariance, rms_px
 
 
 @inlined
@@ -210,14 +211,6 @@ def huber_weights(m, p, edge_sd, feature_sd, huber, residual, scaled, weight):
                 scale = sd[i] * inflate
                 weight[start + i] = 1.0 / (scale * scale) / max(1.0, abs(residual[start + i]) / (huber * scale))
     return edges
-
-
-@inlined
-def turn_columns(columns, first, turned):
-    """Columns (n, q) as rows from ``first`` on."""
-    for i in range(len(columns)):
-        for j in range(columns.shape[1]):
-            turned[first + j, i] = columns[i, j]
 
 
 @inlined

@@ -45,7 +45,6 @@ from estimators.frame_residuals import (
     FrameShape,
     huber_weights,
     lower_products,
-    turn_columns,
 )
 from estimators.virtual_camera import (
     CAMERA,
@@ -409,54 +408,3 @@ def fit_frame(deformation, basis, shell, lens, edge, features, prior, limits, re
         if largest < last_step:
             break
     return DONE, taken + 1
-
-
-@kernel
-def solved_step(columns, residual, weight, prior, flattening, formal, found):
-    """Formal covariance (n, n) of a weighted least-squares step and the step ``found`` (n,), with the priors.
-
-    ``columns`` (m, n): derivatives by deflection, flattening, joint, lobes and light. ``prior``: mean and sd of all but
-    the deflection, the flattening's about ``flattening``, which comes on top of the step.
-    """
-    m, n = columns.shape
-    turned, normal = np.empty((n + 1, m)), np.empty((n + 1, n + 1))
-    turn_columns(columns, 0, turned)
-    for i in range(m):
-        turned[n, i] = residual[i]
-    lower_products(turned, m, weight, 0, np.empty(m), normal)
-    _add_prior(prior, flattening, n - len(prior[0]), normal, found)
-    small_cholesky(normal, n, normal)
-    small_solve(normal, n, found)
-    unit = np.empty(n)
-    for a in range(n):
-        unit[:] = 0.0
-        unit[a] = 1.0
-        small_solve(normal, n, unit)
-        for b in range(n):
-            formal[a, b] = unit[b]
-
-
-@kernel
-def used_points(basis, rows, shape, residual, left, weight, columns, of_used):
-    """Move points with non-zero weight to the front; returns their number and the weighted square of ``left``.
-
-    ``columns`` (n, k + 17): derivatives by deflection, flattening, joint, lobes and light. ``of_used``: places of the
-    points, their rows (n, 16), residuals and weights.
-    """
-    at, used_rows, used_residual, used_weight = of_used
-    k, count, square, total = basis.shape[1], 0, 0.0, 0.0
-    for i in range(len(weight)):
-        if weight[i] > 0.0:
-            at[count] = i
-            for j in range(k):
-                columns[count, j] = rows[i, 0] * basis[0, j] + rows[i, 1] * basis[1, j]
-            columns[count, k], columns[count, k + 1] = rows[i, 2], rows[i, JOINT]
-            for j in range(SHAPES):
-                columns[count, k + 2 + j] = shape[i, j]
-            for j in range(COLUMNS):
-                used_rows[count, j] = rows[i, j]
-            used_residual[count], used_weight[count] = residual[i], weight[i]
-            square += weight[i] * left[i] * left[i]
-            total += weight[i]
-            count += 1
-    return count, square / total if total > 0.0 else 0.0

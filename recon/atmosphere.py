@@ -32,6 +32,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
+from scipy.linalg import block_diag
 
 from flightmodel import earth, rotations
 from flightmodel.aerodynamics import AeroTable
@@ -46,6 +47,7 @@ from flightmodel.atmosphere import (
     unresolved_variance,
 )
 from flightmodel.checks import BoolArray, Check, FloatArray, GateError
+from flightmodel.least_squares import Estimate, Linearised, least_squares
 from flightmodel.statistics import correlation
 from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
@@ -59,6 +61,7 @@ LEAST_AXIAL_MPS2 = 0.5  # below, the deceleration does not depend on the air mea
 _LEAST_SAMPLES = 20  # windows: fewer say little of a profile
 # of the deceleration, axial and lateral: model error of coefficients and of an oscillating joint
 _AXIAL_PART, _LATERAL_PART, _MODEL_FLOOR_MPS2 = 0.01, 0.02, 0.03
+_SETTLED_SD = 1e-2  # far below any error
 _FLEXURE_SD = (1.0, 0.3, *[float(np.deg2rad(3.0))] * 4)  # gain, growth, offsets
 # log of the ratio of Mach numbers over which the error of C_A's shape forgets: about a flow regime, as the sources of
 # coefficients (ranges, tunnels, CFD) change from one to the next; assumed
@@ -272,16 +275,18 @@ def reconstruct_air(
     drag_ratio = _drag_ratio(model)
     height = _knots(samples.altitude_m, _KNOT_M)
     blocks, information = _prior(samples, drag, drag_ratio["mach"].to_numpy(), height)
-    estimate, covariance, residual = _least_squares(model, blocks, information)
+    found = _estimated(model, blocks, information)
+    estimate, covariance = found.value, found.covariance
     sd = np.sqrt(np.diag(covariance))
     rows = slice(3 * len(height), 3 * len(height) + len(_PARAMETERS))
     own, own_sd, prior_sd = estimate[rows].copy(), sd[rows].copy(), np.array([drag.ca_sd, drag.cn_sd, *_FLEXURE_SD])
     prior_sd[0], own[0], own_sd[0] = _ca_of_pulse(model, drag_ratio, blocks, information, estimate, covariance)
+    sound = _consistency_checks(height, estimate, sd, (own[0], own_sd[0]), confidence)
     return ReconstructedAir(
         _profile(model, height, estimate, sd),
         drag_ratio,
         _parameters(prior_sd, own, own_sd),
-        (*_consistency_checks(height, estimate, sd, (own[0], own_sd[0]), confidence), *_residual_checks(residual)),
+        (*sound, *_residual_checks(found.linear.residual.reshape(-1, 3))),
     )
 
 
@@ -327,38 +332,28 @@ def _ca_of_pulse(
     return prior_sd, float(weights @ estimate), float(np.sqrt(weights @ covariance @ weights))
 
 
-def _least_squares(
-    model: _Model, blocks: list[FloatArray], information: list[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Normalised unknowns (u,), their covariance, and residuals (n, 3) in standard deviations."""
-    from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
-
+def _estimated(model: _Model, blocks: list[FloatArray], information: list[FloatArray]) -> Estimate:
+    """Normalised unknowns (u,), and residuals of the forces (3 n,) in standard deviations."""
     prior = block_diag(*information)
-    x = np.zeros(len(prior))
     edges = np.cumsum([0, *(b.shape[1] for b in blocks)])
     measured = model.samples.specific_force_body_mps2
     sd = np.hypot(_MODEL_FLOOR_MPS2, np.array([_AXIAL_PART, _LATERAL_PART, _LATERAL_PART]) * np.abs(measured[:, :1]))
-    for _ in range(20):
+
+    def linearised(x: FloatArray) -> Linearised:
         local = np.column_stack([b @ x[i:j] for b, i, j in zip(blocks, edges[:-1], edges[1:], strict=True)])
         force, partials = model.linearised(local)
-        residual = (measured - force) / sd
-        jacobian = np.concatenate(
-            [(partials[:, :, k] / sd)[:, :, None] * b[:, None, :] for k, b in enumerate(blocks)], axis=2
-        ).reshape(-1, len(x))
-        try:
-            factor = cho_factor(jacobian.T @ jacobian + prior)
-        except (LinAlgError, ValueError):  # steps led to forces that are not finite
-            raise GateError(
-                "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
-                "consistency checks, and check the accelerometer's axes, units and mount",
-                code="not-converged",
-            ) from None
-        step = cho_solve(factor, jacobian.T @ residual.ravel() - prior @ x)
-        x = x + step
-        covariance = cho_solve(factor, np.eye(len(x)))
-        if np.abs(step / np.sqrt(np.diag(covariance))).max() < 1e-2:  # far below any error
-            break
-    return x, covariance, residual
+        by_unknown = [(partials[:, :, k] / sd)[:, :, None] * b[:, None, :] for k, b in enumerate(blocks)]
+        jacobian = np.concatenate(by_unknown, axis=2).reshape(-1, len(x))
+        return Linearised.of(((measured - force) / sd).ravel(), jacobian, 1.0, prior, x)
+
+    found = least_squares(linearised, np.zeros(len(prior)), _SETTLED_SD)
+    if not found.converged:
+        raise GateError(
+            "air: no density and winds near the sounding's explain the deceleration along this trajectory; see the "
+            "consistency checks, and check the accelerometer's axes, units and mount",
+            code="not-converged",
+        )
+    return found
 
 
 def _profile(model: _Model, height: FloatArray, estimate: FloatArray, sd: FloatArray) -> pd.DataFrame:

@@ -2,9 +2,9 @@
 
 At times of the sites' readings, at most two a second, the others' readings are interpolated where they have some on
 both sides within `_BRIDGED_S`. With three components or more a point is their weighted least-squares solution
-(Gauss-Newton with Levenberg's damping), started on a site's ray where there is one, else above the sites. Points whose
-normal matrix is nearly singular (rays that are parallel, ranges from sites on a line) are left out. The filter takes
-the readings themselves; from these points it only starts.
+(`flightmodel.least_squares`), started on a site's ray where there is one, else above the sites. Points whose normal
+matrix is nearly singular (rays that are parallel, ranges from sites on a line) are left out. The filter takes the
+readings themselves; from these points it only starts.
 
 References
 ----------
@@ -16,10 +16,12 @@ from __future__ import annotations
 import numpy as np
 
 from flightmodel.checks import FloatArray
+from flightmodel.least_squares import Estimate, Linearised, least_squares
 from recon.measurements import RADAR, Instrument, sight, sight_partials, wrapped
 
 _BRIDGED_S = 3.0  # over which a parabola's chord is off by some tens of metres at 10 m/s2: enough to linearise about
 _WORST_SD_M = 5e3  # of a point: beyond it the filter would linearise far from the path
+_SETTLED_SD = 1e-3  # of a point: its readings are known to some metres at the best
 
 
 def triangulated(sites: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]:
@@ -35,7 +37,9 @@ def triangulated(sites: tuple[Instrument, ...]) -> tuple[FloatArray, FloatArray]
     out, good = np.empty((len(t), 3)), np.zeros(len(t), dtype=bool)
     before = None
     for k in range(len(t)):
-        out[k], good[k] = _point(sites, readings[:, k], weights, before)
+        point = _point(sites, readings[:, k], weights, before)
+        good[k] = point.converged and point.condition < 1e12 and np.trace(point.covariance) < _WORST_SD_M**2
+        out[k] = point.value
         before = out[k] if good[k] else before
     return t[good], out[good]
 
@@ -67,22 +71,17 @@ def _at(site: Instrument, t: FloatArray) -> FloatArray:
 
 def _point(
     sites: tuple[Instrument, ...], readings: FloatArray, weights: FloatArray, before: FloatArray | None
-) -> tuple[FloatArray, bool]:
-    """Least-squares point (3,) of readings (sites, 3), and whether it is well fixed."""
-    at = _first_guess(sites, readings) if before is None else before
-    damping, (cost, step, normal) = 1e-3, _normal(sites, readings, weights, at)
-    for _ in range(50):
-        move = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), step)
-        tried = _normal(sites, readings, weights, at + move)
-        if tried[0] < cost:
-            at, (cost, step, normal), damping = at + move, tried, 0.1 * damping
-        else:
-            damping *= 10.0
-        if np.linalg.norm(move) < 0.1:
-            break
-    if np.linalg.cond(normal) > 1e12:
-        return at, False
-    return at, bool(np.sqrt(np.trace(np.linalg.inv(normal))) < _WORST_SD_M)
+) -> Estimate:
+    """Least-squares point (3,) of readings (sites, 3), whose noise is one over ``weights``."""
+
+    def linearised(at: FloatArray) -> Linearised:
+        ned = [site.dcm @ (at - site.site_ecef_m) for site in sites]
+        missed = np.array([wrapped(RADAR, read - sight(*one)) for read, one in zip(readings, ned, strict=True)])
+        partials = np.array([sight_partials(*one) @ site.dcm for site, one in zip(sites, ned, strict=True)])
+        there = np.isfinite(missed)
+        return Linearised.of(missed[there], partials[there], weights[there] ** 2)
+
+    return least_squares(linearised, _first_guess(sites, readings) if before is None else before, _SETTLED_SD)
 
 
 def _first_guess(sites: tuple[Instrument, ...], readings: FloatArray) -> FloatArray:
@@ -102,19 +101,3 @@ def _first_guess(sites: tuple[Instrument, ...], readings: FloatArray) -> FloatAr
     across = [np.eye(3) - np.outer(u, u) for u, there in zip(along, rays, strict=True) if there]
     met = sum(a @ p for a, p in zip(across, places[rays], strict=True))
     return np.asarray(np.linalg.lstsq(sum(across, np.zeros((3, 3))), met, rcond=None)[0])
-
-
-def _normal(
-    sites: tuple[Instrument, ...], readings: FloatArray, weights: FloatArray, at: FloatArray
-) -> tuple[float, FloatArray, FloatArray]:
-    """Cost, right-hand side (3,) and normal matrix (3, 3) of the least-squares problem about a point."""
-    cost, step, normal = 0.0, np.zeros(3), 1e-18 * np.eye(3)
-    for site, reading, weight in zip(sites, readings, weights, strict=True):
-        ned = site.dcm @ (at - site.site_ecef_m)
-        missed = reading - np.array(sight(*ned))
-        missed = wrapped(RADAR, missed)
-        there = np.isfinite(missed)
-        a = (sight_partials(*ned) @ site.dcm)[there] * weight[there, None]
-        r = missed[there] * weight[there]
-        cost, step, normal = cost + float(r @ r), step + a.T @ r, normal + a.T @ a
-    return cost, step, normal

@@ -27,7 +27,7 @@ from estimators.edge import (
     steps_near,
 )
 from estimators.features import dark_centres
-from estimators.frame_checks import motion_beside
+from estimators.frame_checks import Design
 from estimators.frame_residuals import huber_weights, waves_round
 from estimators.frame_solution import DONE, SHAPES, fit_frame
 from estimators.texture import correlations, find_patches
@@ -35,7 +35,7 @@ from estimators.virtual_camera import VirtualCamera, feet, limb_points
 from flightmodel.camera import Camera, camera_from_mount
 from flightmodel.deflection import lv_clock, lv_direction
 from flightmodel.rendering import fill
-from tests.oracles import plain_fit, plain_horizon, plain_sight
+from tests.oracles import plain_horizon, plain_sight
 
 from .conftest import VEHICLE
 
@@ -474,19 +474,26 @@ def test_the_fit_is_the_most_probable_one():
 
 @pytest.mark.parametrize("terms", [1, 4, 12])
 @pytest.mark.parametrize("is_seen", [True, False])
-def test_the_motion_beside_a_fit_is_that_of_the_plain_equations(terms, is_seen):
+def test_the_motion_beside_a_fit_is_that_of_a_fit_of_both(terms, is_seen):
     """Of columns as unlike as radians and pixels; and where one term of the motion moves no point."""
     rng = np.random.default_rng(terms)
     columns, by = rng.normal(size=(61, 19)), rng.normal(size=(61, terms)) * 300.0 ** rng.random(terms)
     by[:, -1] *= is_seen
-    residual, weight = rng.normal(size=61), rng.random(61)
-    formal = np.linalg.inv((columns.T * weight) @ columns + np.diag(rng.random(19)))
-    motion = np.empty(terms)
-    square = motion_beside(columns, formal, by, residual, weight, 0.02, motion)
-    expected, expected_square = plain_fit.motion_beside(columns, formal, by, residual, weight, 0.02)
-    np.testing.assert_allclose(motion, expected, rtol=1e-7, atol=1e-12)
-    assert square == pytest.approx(expected_square, rel=1e-8, abs=1e-12)
-    assert (square > 0.0) == (is_seen or terms > 1)
+    residual, weight, prior = rng.normal(size=61), rng.random(61), np.diag(rng.random(19))
+    formal = np.linalg.inv((columns.T * weight) @ columns + prior)
+    design = Design(columns, formal, np.empty((61, 4)), np.empty((61, 2)), 1.0, residual, weight, 0)
+    motion, square = design.motion(by, 0.02)
+    seen = terms - (not is_seen)
+    both = np.column_stack([columns, by[:, :seen]])
+    joint = (both.T * weight) @ both
+    joint[:19, :19] += prior
+    covariance = np.linalg.inv(joint)
+    expected = (covariance @ (both.T @ (weight * residual)))[19:]
+    np.testing.assert_allclose(motion[:seen], expected, rtol=1e-7, atol=1e-12)
+    np.testing.assert_array_equal(motion[seen:], 0.0)
+    allowed = covariance[19:, 19:] + 0.02**2 * np.eye(seen)
+    assert square == pytest.approx(expected @ np.linalg.solve(allowed, expected), rel=1e-8, abs=1e-12)
+    assert (square > 0.0) == (seen > 0)
 
 
 def test_large_residuals_pull_no_harder_than_huber_lets_them():

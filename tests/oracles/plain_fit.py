@@ -45,15 +45,3 @@ def plain_fit(oriented, horizon, place, start):
         if np.abs(step[:3]).max() < LAST_STEP_RAD:
             break
     return deformation
-
-
-def motion_beside(columns, formal, by, residual, weight, allowed):
-    """Motion (m,) beside a fit that explains the residuals best, with derivatives (n, m), and its chi-square."""
-    turned = by.T * weight
-    gain, crossed = formal @ (columns.T * weight), turned @ columns
-    inverse = turned @ by - crossed @ (gain @ by)
-    value, axes = np.linalg.eigh(inverse)
-    along = axes.T @ (turned @ residual - crossed @ (gain @ residual))
-    known = value > len(value) * np.finfo(float).eps * value[-1]
-    along, value = along[known], value[known]
-    return axes[:, known] @ (along / value), np.sum(along**2 / (value * (1.0 + allowed**2 * value)))
