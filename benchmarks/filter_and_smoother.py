@@ -28,7 +28,7 @@ from problem import minima
 from flightmodel import earth, rotations
 from flightmodel.instruments import RADAR, RadarSite, TriadSpec
 from flightmodel.telemetry import RadarRecord
-from recon import kalman, smoother
+from recon import kalman
 from recon.measurements import radar_instrument
 from recon.problem import Problem, observe
 from recon.propagation import strapdown_motion
@@ -108,7 +108,7 @@ def problem_of(motion, node, start, z):
 def ours(problem, reference=None):
     """Filter and smoother, moments at every radar point: about its own estimate, or about a reference."""
     run = kalman.forward(problem, reference)
-    return run, smoother.smooth(problem, run)
+    return run, kalman.smooth(problem, run)
 
 
 class Plain:

@@ -32,7 +32,7 @@ CALLS = {
     **dict.fromkeys(("Issue", "refuse", "refuse_config", "NoFitError", "__init__"), (1, 0)),
     **dict.fromkeys(("line", "_line"), (2, 1)),
     "data_sheet_check": (0, 8),
-    "Single": (0, 1),
+    "Hypothesis": (0, 1),
     "_of_either": (0, 1),
     **dict.fromkeys(("Check", "Check.of"), (0, 6)),
 }

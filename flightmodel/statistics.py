@@ -22,6 +22,7 @@ from scipy.special import gammaincinv
 
 from flightmodel.checks import BoolArray, FloatArray
 
+ACCEPTED_ODDS = math.log(1000.0)  # from which one hypothesis is accepted over another, as a logarithm
 NORMAL_MAD = 1.4826  # sd of a normal variable over the median of its absolute values
 KNOTS_A_LENGTH = 3  # of a Gauss-Markov history, in one correlation length
 BAND_PERCENTILES = (2.3, 50.0, 97.7)

@@ -26,7 +26,7 @@ from flightmodel.aerodynamics import COLUMNS, AeroTable
 from flightmodel.checks import Check, FloatArray, GateError
 from flightmodel.files import write_file
 from flightmodel.tabular import Tabular
-from recon.consistency import MOST_KEPT_SD, data_sheet_check
+from recon.state import MOST_KEPT_SD, data_sheet_check
 
 TABLE = "aero_as_flown"
 _ANGLE_DIGITS = 13  # angles must be evenly spaced to 1e-9

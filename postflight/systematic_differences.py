@@ -63,13 +63,12 @@ from scipy.special import logsumexp
 from flightmodel import earth, rotations
 from flightmodel.checks import BoolArray, FloatArray, GateError
 from flightmodel.earth import undulation_m
-from flightmodel.statistics import chi_square_quantile, decimals, pair
+from flightmodel.statistics import ACCEPTED_ODDS, chi_square_quantile, decimals, pair
 from flightmodel.tabular import Tabular
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from postflight.intake.other_trajectory import OtherTrajectory
 
 _LEAST_EPOCHS = 20  # fewer decide nothing among so many effects
-_LEAST_ODDS = np.log(1000.0)  # for one more effect
 _CONFIDENCE = 0.999  # one false alarm in a thousand comparisons
 _FAR_S, _FAR_STEP_S = 40.0, 0.25  # of time offsets that are looked for: leap seconds, a second's slip
 _MARGIN_S = 2.0 * _FAR_STEP_S  # about each of them
@@ -286,7 +285,7 @@ def _with_datum(best: _Explained, datum: _Fit) -> _Explained:
     # the same effects with a shift in the datum's place: what else differs must not speak for the datum
     without = best.fit.solved(tuple(dict.fromkeys((*by_datum.names, "shift"))))
     gains = [by_datum.odds_over(rival) + _shift_odds(by_datum, rival) for rival in (best, without)]
-    return by_datum if min(gains) > _LEAST_ODDS else best
+    return by_datum if min(gains) > ACCEPTED_ODDS else best
 
 
 def _covered(run: Trajectory, time_s: FloatArray, offset_s: float) -> BoolArray:
@@ -421,7 +420,7 @@ class _Fit:
             more = [(*current.names, name) for name in self.names if name not in current.names]
             trials = [trial for names in more if self._possible(trial := self.solved(names, current.x))]
             best = max(trials, key=lambda t: t.odds_over(current), default=None)
-            if best is None or best.odds_over(current) < _LEAST_ODDS:
+            if best is None or best.odds_over(current) < ACCEPTED_ODDS:
                 # a lasting effect can look like one long correlated error, of a size that the covariances exclude
                 best = max(trials, key=_size_of_last, default=None)
                 if best is None or _size_of_last(best) < 1.0:
@@ -429,7 +428,7 @@ class _Fit:
             current = best
             for name in current.names[:-1]:
                 fewer = self.solved(tuple(n for n in current.names if n != name), current.x)
-                needless = current.odds_over(fewer) < _LEAST_ODDS and _Allowed.of(current, name).size_in_limit < 1.0
+                needless = current.odds_over(fewer) < ACCEPTED_ODDS and _Allowed.of(current, name).size_in_limit < 1.0
                 if self._possible(fewer) and needless:
                     current = fewer
         return current

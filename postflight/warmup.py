@@ -25,7 +25,7 @@ from flightmodel._kernels import CACHE
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.vehicle import Vehicle, vehicle_from_toml, vehicle_path
 from postflight.beside import start_method, worker_pool
-from recon import kalman, linearise, propagation, smoother
+from recon import kalman, linearise, propagation
 from recon.measurements import Instrument
 from recon.problem import Problem, observe
 from recon.propagation import strapdown_motion
@@ -117,7 +117,7 @@ def _filter() -> None:
     run.p_last[:] = problem.start_covariance
     slots, wander = problem.sources().slot, problem.model.wander
     kalman.filter_nodes(problem.observed, slots, wander, problem.gate, 0, 3, x, *line[1:], run, innovations)
-    smoother.smooth(problem, kalman.ForwardPass(States(*line.charts), *line[1:], run, innovations))
+    kalman.smooth(problem, kalman.ForwardPass(States(*line.charts), *line[1:], run, innovations))
 
 
 def _balance() -> None:

@@ -52,8 +52,8 @@ from flightmodel.statistics import correlation
 from flightmodel.telemetry import LARGEST_GAP_S, Telemetry
 from flightmodel.trajectory import Trajectory, interpolate_rows, resample
 from flightmodel.vehicle import Vehicle
-from recon.consistency import data_sheet_check
 from recon.estimate import TrajectorySolution
+from recon.state import data_sheet_check
 
 # a third of the winds' correlation length
 _KNOT_M, _TRAJECTORY_TIME_S = 1000.0, 20.0

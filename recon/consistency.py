@@ -40,17 +40,15 @@ from scipy.special import ndtri
 from flightmodel.checks import BoolArray, Check, FloatArray, IntArray, Issue
 from flightmodel.instruments import RADAR as RADAR_ERRORS
 from flightmodel.statistics import chi_square_quantile
-from recon.kalman import ForwardPass, Innovations
+from recon.kalman import ForwardPass, Innovations, Smoothed, smoothed_covariance
 from recon.linearise import jacobian
 from recon.measurements import DECELERATION, RADAR, REST, SLOT_NAMES
 from recon.problem import FIT_SPAN_S, Problem
 from recon.settings import Settings
-from recon.smoother import Smoothed, smoothed_covariance
-from recon.state import KINEMATIC, States, boxminus, unpacked
+from recon.state import KINEMATIC, States, boxminus, data_sheet_check, unpacked
 
 _MOST_EDITED = 0.05  # share of a source's points
 _LEAST_INSIDE = 0.90
-MOST_KEPT_SD = 0.98  # of the a priori sd: an error that keeps more of it was not observable
 _MOST_PREDICTED = 4000  # held-out measurements; more are thinned evenly
 _COLUMNS = ("time_s", "source", "component", "residual", "predicted_sd")
 # code, name and advice for the a priori errors of a ballistic flight's air and vehicle
@@ -133,36 +131,6 @@ def edit_check(source: str, accepted: BoolArray) -> Check:
     return Check.of(
         "edited", f"edited {source}", float(1.0 - np.mean(accepted)), 0.0, _MOST_EDITED, symptom, symptom,
         advice="it disagrees with the rest of the data, and either may be wrong", source=source,
-    )  # fmt: skip
-
-
-def data_sheet_check(
-    code: str,
-    label: str,
-    source: str,
-    components: list[str],
-    estimate: FloatArray,
-    prior_sd: FloatArray,
-    sd: FloatArray,
-    confidence: float,
-    bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
-    good: str = "estimated sensor errors are consistent with the data sheet; largest:",
-) -> Check | None:
-    """Largest normalised shift (k,) of a priori errors of one source from zero; None where no error was observable.
-
-    The remark names the ``components`` entry that moved most: ``bad`` follows its name, ``good`` goes before it.
-    """
-    observable = sd < MOST_KEPT_SD * prior_sd
-    if not observable.any():
-        return None
-    shift = np.abs(estimate[observable]) / np.sqrt(prior_sd[observable] ** 2 - sd[observable] ** 2)
-    tail = 0.5 * (1.0 - confidence) / int(observable.sum())
-    worst = str(np.array(components, dtype=object)[observable][int(np.argmax(shift))])
-    name = f"{source} {worst}".strip()
-    symptom, _, advice = bad.partition(": ")
-    return Check.of(
-        code, label, float(shift.max()), 0.0, float(-ndtri(tail)), f"{good} {name}, {shift.max():.1f} sd",
-        f"{name} {symptom}", advice=advice, source=source, component=worst,
     )  # fmt: skip
 
 

@@ -47,7 +47,6 @@ from recon import (
     imu_screening,
     kalman,
     oscillation,
-    smoother,
     survey,
     time_bias,
     tracker_time,
@@ -58,19 +57,20 @@ from recon.entry_density import DragHistory, drag_of_drivers, drag_of_readings
 from recon.fault_detection import (
     UnmodelledAcceleration,
     carried_check,
+    jumps_of_clocks,
     unsupported_offsets,
     with_unmodelled,
 )
 from recon.fault_isolation import NO_ADAPTATION, Adaptation, LeftOut
 from recon.first_passes import SpinPhase
+from recon.hypotheses import Explanation
 from recon.imu_screening import BridgedSensor
+from recon.kalman import Smoothed
 from recon.measurements import DECELERATION
 from recon.problem import Problem, with_servo_lag
 from recon.propagation import correct, correction_partials
 from recon.settings import Settings
 from recon.setup import InertialSensors, build_problem
-from recon.single_faults import SingleFault
-from recon.smoother import Smoothed
 from recon.state import KINEMATIC, States, unpacked
 
 _BLOCK = 1 << 16  # samples that are corrected at a time
@@ -112,8 +112,8 @@ class TrajectorySolution:
         Leave-one-out comparison of the trackers, where a check about one failed.
     adaptation : Adaptation
         What was found in the data, for other reconstructions that are to be compared with this one.
-    single_faults : tuple of SingleFault
-        Single hypotheses that explain what failed, the likeliest first.
+    single_faults : tuple of Explanation
+        Hypothesis hypotheses that explain what failed, the likeliest first.
     drag : DragHistory or None
         What the deceleration says of the air; None without accelerometer and drag.
     """
@@ -135,7 +135,7 @@ class TrajectorySolution:
     provenance: dict[str, object]
     left_out: tuple[LeftOut, ...] = ()
     adaptation: Adaptation = NO_ADAPTATION
-    single_faults: tuple[SingleFault, ...] = ()
+    single_faults: tuple[Explanation, ...] = ()
     drag: DragHistory | None = None
 
     @property
@@ -341,7 +341,7 @@ def _screened(
         return replace(adaptation, jumps=(), rejected_offsets=())
     both = sensors.force, sensors.rate
     if adaptation.jumps is None:
-        jumps = time_bias.jumps_of_clocks(problem, run, (telemetry.accelerometer, telemetry.rates), both)
+        jumps = jumps_of_clocks(problem, run, (telemetry.accelerometer, telemetry.rates), both)
         adaptation = replace(adaptation, jumps=jumps)
         if jumps:
             return adaptation
@@ -359,7 +359,7 @@ def bridge_inertial_sensors(telemetry: Telemetry, adaptation: Adaptation = NO_AD
     out = []
     for number, record in enumerate(r for r in records if r is not None):
         rejected = tuple(d for d in adaptation.rejected_offsets or () if d.sensor == number)
-        tags = time_bias.with_corrected_tags(record, number, adaptation.jumps or ())
+        tags = imu_screening.with_corrected_tags(record, number, adaptation.jumps or ())
         out.append(imu_screening.bridge(tags, number, rejected))
     return InertialSensors(*out)
 
@@ -377,7 +377,9 @@ def _sensor_findings(telemetry: Telemetry, sensors: InertialSensors | None, adap
     if telemetry.drag_accelerometer is not None:
         findings += imu_screening.frozen_findings(telemetry.drag_accelerometer)
     if sensors is not None:
-        findings += time_bias.jump_findings(adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name))
+        findings += imu_screening.jump_findings(
+            adaptation.jumps or (), (sensors.force.spec.name, sensors.rate.spec.name)
+        )
     return findings
 
 
@@ -412,7 +414,7 @@ def _iterate(
         problem = with_servo_lag(problem, reference)
         run, found = first_passes.follow_track(problem, reference, settings, found)
         report(0.1 + share * (i + 0.6), f"smoother, pass {i + 1}")
-        smoothed = smoother.smooth(problem, run)
+        smoothed = kalman.smooth(problem, run)
         kept = np.flatnonzero(problem.kept)
         moved = np.abs(smoothed.x[kept]) / np.sqrt(np.maximum(smoothed.variance, 1e-300))
         smoothed_states = smoothed.states(run.charts)

@@ -28,6 +28,12 @@ the same noise (`recon.propagation.with_disturbances`).
 
 What contradicts a whole tracker or a data sheet: `recon.fault_isolation`.
 
+**Jumps of a clock.** A clock that jumps ahead leaves a gap like any other, but behind it all tags are late by the gap
+(or all before it were early, where the clock was set right). For each short gap the trackers give the likelihood of so
+late a clock from there on against that of none (the scores above, with the clock's column in place of a bias's), and
+the lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the
+tags are corrected.
+
 References
 ----------
 A. Willsky, H. Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in linear
@@ -46,13 +52,16 @@ import numpy as np
 
 from flightmodel._kernels import inlined, kernel, multiply
 from flightmodel.checks import Check, DivergenceError, FloatArray, IntArray, Issue
-from recon.imu_screening import TransientOffset
+from flightmodel.statistics import ACCEPTED_ODDS
+from flightmodel.telemetry import TriadRecord
+from recon.imu_screening import BridgedSensor, ClockJump, TransientOffset, gaps_of_tags
 from recon.kalman import ForwardPass, Innovations
 from recon.measurements import SLOTS
 from recon.problem import Problem
+from recon.state import KINEMATIC, States
+from recon.time_bias import lag_between
 
 _BIASES = np.array([9, 10, 11, 18, 19, 20])  # columns of the transition: accelerometer, then gyros
-LOG_LIKELIHOOD_LIMIT = np.log(1000.0)  # ratio from which one hypothesis is accepted over the other
 _SCORE_LIMIT = 16.3  # of chi-square with three degrees of freedom, one in a thousand
 UNMODELLED_CODE = "unmodelled-acceleration"
 _REJECTED_S = 5.0  # no point accepted for so long in ballistic flight, or, in any, to the end of the track
@@ -90,7 +99,7 @@ def unsupported_offsets(
         k = 3 * d.sensor + d.axis
         log_ratio = -s[k] * offset - 0.5 * offset**2 * v[k, k]
         chi_square = s[axes] @ np.linalg.pinv(v[axes, axes], hermitian=True) @ s[axes]
-        if log_ratio > -LOG_LIKELIHOOD_LIMIT or chi_square > _SCORE_LIMIT:
+        if log_ratio > -ACCEPTED_ODDS or chi_square > _SCORE_LIMIT:
             out.append(d)
     return tuple(out)
 
@@ -421,3 +430,66 @@ def _not_carried(found: tuple[UnmodelledAcceleration, ...]) -> DivergenceError:
         "t0_utc. State spans of heavy vibration in [[motion.disturbed]]",
         code="track-not-followed",
     )
+
+
+def jumps_of_clocks(
+    problem: Problem,
+    run: ForwardPass,
+    records: tuple[TriadRecord, TriadRecord],
+    sensors: tuple[BridgedSensor, BridgedSensor],
+) -> tuple[ClockJump, ...]:
+    """Gaps that are jumps of a clock, in order of time.
+
+    Parameters
+    ----------
+    problem : Problem
+    run : ForwardPass
+        Made with all tags as delivered.
+    records, sensors : (accelerometer, gyros)
+        As delivered, and as the run took them.
+    """
+    gaps = [g for g in gaps_of_tags(records) if problem.time_s[0] < g.at_s < problem.time_s[-1] - g.by_s]
+    log_ratio, path = _by_trackers(problem, run, gaps), run.states()
+    edges = [-np.inf, *(g.at_s for g in gaps), np.inf]
+    out = []
+    for k, gap in enumerate(gaps):
+        likely = log_ratio[k] + _by_lags(gap, edges[k], edges[k + 2], sensors, path, problem.time_s)
+        if likely.max() > ACCEPTED_ODDS:
+            out.append(gap._replace(after=bool(likely[0] >= likely[1])))
+    return tuple(out)
+
+
+def _by_trackers(problem: Problem, run: ForwardPass, gaps: list[ClockJump]) -> FloatArray:
+    """Logarithm of the likelihood (g, 2) of late tags after, and of early ones before each gap, against neither."""
+    out = np.zeros((len(gaps), 2))
+    if not gaps or not problem.motion.clocks or problem.model.wander.considered.any():
+        return out
+    columns = KINEMATIC + np.array([18, 19])
+    nodes = np.searchsorted(problem.time_s, [g.at_s for g in gaps]).astype(np.int64)
+    first, last = np.zeros_like(nodes), np.full_like(nodes, len(problem.time_s) - 1)
+    both = (offset_scores(problem, run, nodes, last, columns), offset_scores(problem, run, first, nodes, columns))
+    for side, (sign, (score, variance)) in enumerate(zip((1.0, -1.0), both, strict=True)):
+        for k, gap in enumerate(gaps):
+            offset = np.zeros(2)
+            offset[list(gap.sensors)] = sign * gap.by_s
+            out[k, side] = -score[k] @ offset - 0.5 * offset @ variance[k] @ offset
+    return out
+
+
+def _by_lags(
+    gap: ClockJump,
+    from_s: float,
+    to_s: float,
+    sensors: tuple[BridgedSensor, BridgedSensor],
+    path: States,
+    time_s: FloatArray,
+) -> float:
+    """Logarithm of the likelihood that one clock jumped against the other, over that of none."""
+    if len(gap.sensors) > 1:
+        return 0.0
+    before = lag_between(*sensors, path, time_s, from_s, gap.at_s - gap.by_s)
+    after = lag_between(*sensors, path, time_s, gap.at_s + gap.by_s, to_s)
+    if before is None or after is None:
+        return 0.0
+    jumped = gap.by_s if gap.sensors == (0,) else -gap.by_s
+    return ((after.lag_s - before.lag_s) * jumped - 0.5 * jumped**2) / (after.sd_s**2 + before.sd_s**2)

@@ -37,14 +37,14 @@ from flightmodel.checks import BoolArray, Check, FloatArray, GateError, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, nearest_index, resample
-from recon.consistency import MOST_KEPT_SD, SAME_STRETCH_S, beyond_gate, edit_check
-from recon.imu_screening import TransientOffset
+from recon.consistency import SAME_STRETCH_S, beyond_gate, edit_check
+from recon.hypotheses import TRIADS, Explanation, likeliest
+from recon.imu_screening import ClockJump, TransientOffset
 from recon.measurements import SITES
 from recon.oscillation import Oscillation
 from recon.problem import Problem
-from recon.single_faults import TRIADS, SingleFault, likeliest
-from recon.state import KINEMATIC
-from recon.time_bias import ClockJump, Lag
+from recon.state import KINEMATIC, MOST_KEPT_SD
+from recon.time_bias import Lag
 
 _CONFIDENCE = 0.999  # of each test: of some twenty a flight, one false alarm in fifty flights
 _LEAST_LOST = 0.05  # of its variance that a solution loses by leaving a source out, for the test
@@ -345,7 +345,7 @@ def prior_inflation_findings(
 
 
 def isolate_faults(
-    checks: tuple[Check, ...], left_out: tuple[LeftOut, ...], singles: tuple[SingleFault, ...] = ()
+    checks: tuple[Check, ...], left_out: tuple[LeftOut, ...], singles: tuple[Explanation, ...] = ()
 ) -> tuple[Issue, ...]:
     """Fault hypotheses, the most likely first; none where every check passes."""
     failed = [v for v in checks if not v.passed]
@@ -355,7 +355,7 @@ def isolate_faults(
     return (*first, *_from_checks(failed, left_out))
 
 
-def _single_hypothesis(singles: tuple[SingleFault, ...]) -> tuple[Issue, ...]:
+def _single_hypothesis(singles: tuple[Explanation, ...]) -> tuple[Issue, ...]:
     """What one fault explains best, with those that are hardly less likely."""
     if not singles:
         return ()

@@ -30,7 +30,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flightmodel.checks import Check, FloatArray, IntArray
-from recon import kalman, propagation, setup, single_faults, smoother
+from flightmodel.statistics import ACCEPTED_ODDS
+from recon import kalman, propagation, setup
 from recon.fault_detection import UnmodelledAcceleration, track_is_lost, with_one_more, with_unmodelled
 from recon.measurements import DECELERATION
 from recon.problem import Problem, with_servo_lag
@@ -42,7 +43,6 @@ _FARTHEST_SD = 3.0  # where a pass overshoots, the next one corrects it from wit
 _CONVERGED_RAD = 0.01  # second-order terms of a rotation this small are 5e-5 of its effect
 _FOLLOWED_RAD = 0.5  # sd of a phase whose 3 sd are a quarter of a turn, beyond which lateral force corrects it wrongly
 _GYROS = slice(KINEMATIC + 9, KINEMATIC + 18)  # their errors
-_LEAST_ODDS = float(np.log(1000.0))  # of one phase over another
 _CLEAR = 30.0  # logarithm of odds beyond which a part is none of the likely ones
 _MOST_PEAKS = 8  # of the likely parts that are tried with the whole prior
 _MOST_PARTS = 200  # a minute of computing
@@ -73,7 +73,7 @@ class SpinPhase:
         prior = f"the gyros' scale and bias leave {np.rad2deg(self.prior_sd_rad):.0f} deg (1 sd) of rotation open"
         odds = f"odds of one phase over the next {np.exp(self.odds):.0f} to 1" if self.odds < 14.0 else "one phase fits"
         return Check.of(
-            "spin-phase", "phase of the spin", self.odds, _LEAST_ODDS, np.inf, f"{prior}; {odds}", f"{prior}; {odds}",
+            "spin-phase", "phase of the spin", self.odds, ACCEPTED_ODDS, np.inf, f"{prior}; {odds}", f"{prior}; {odds}",
             advice="the number of turns is ambiguous: state a later attitude, a smaller scale_sd of the gyros, or use "
             "magnetometer and Sun sensors (attitude_sensors)", source="rates", component="scale",
         )  # fmt: skip
@@ -140,7 +140,7 @@ def converged(
             run = kalman.forward(thinned, reference, engine)
         else:
             run, reference = forward(thinned, reference)
-        smoothed = smoother.smooth(thinned, run, with_covariance=False)
+        smoothed = kalman.smooth(thinned, run, with_covariance=False)
         judged = k or (forward is not None and reference is not None)
         moved = np.abs(smoothed.x[:, ROTATION]).max() if judged else np.inf
         reference = bounded_drivers(thinned, smoothed.states(run.charts))
@@ -185,7 +185,7 @@ def _chosen_phase(thinned: Problem, engine: str) -> tuple[States | None, SpinPha
     def reached(problem: Problem, reference: States | None = None) -> tuple[float, float, States]:
         """Log likelihood, phase and states to which a problem converges."""
         last, run, states = converged(problem, engine, reference)
-        likelihood, _ = single_faults.log_likelihood(last, run)
+        likelihood, _ = kalman.log_likelihood(last, run)
         return likelihood, float(states.sensor_errors[0, 9:18] @ phase_by), states
 
     found: list[tuple[float, float, States]] = []

@@ -52,6 +52,10 @@ _SLOWER = 1.5  # than the record's own usual step
 _GAP, _LONG_GAP = 1.5, 4.5  # usual steps: a straight line serves up to the second, as good as the signal is smooth
 _LEAST_SAMPLES = 10  # of a stretch between gaps: shorter ones carry no trajectory
 _AXES = "xyz"
+LONGEST_LAG_S = 0.08  # a fifth of a period at 2.5 Hz: a longer one is found by `recon.oscillation`
+_SHORTEST_S = 0.004  # that a step is longer than usual: below it the lag cannot be measured
+_LEAST_EXCESS = 0.5  # of a usual step that a step is longer
+_MOST_GAPS = 8  # that are tested, the longest
 
 
 @dataclass(frozen=True)
@@ -557,3 +561,55 @@ def _repeat_nearby(same: BoolArray, first: IntArray, last: IntArray) -> FloatArr
     before = share(np.maximum(first - 1 - _NEIGHBOURS, 0), np.maximum(first - 1, 0))
     after = share(np.minimum(last + 1, len(same)), np.minimum(last + 1 + _NEIGHBOURS, len(same)))
     return np.asarray(np.maximum(before, after))
+
+
+class ClockJump(NamedTuple):
+    """Tags that jump ahead ``by_s`` at ``at_s``, mid-gap; late ones come ``after`` it, or early ones before.
+
+    ``sensors`` that jump together: 0 the accelerometer, 1 the gyros.
+    """
+
+    sensors: tuple[int, ...]
+    at_s: float
+    by_s: float
+    after: bool = True
+
+
+def gaps_of_tags(records: tuple[TriadRecord, TriadRecord]) -> list[ClockJump]:
+    """Short gaps of either sensor or, at one time, of both."""
+    found = []
+    for sensor, record in enumerate(records):
+        step = np.diff(record.time_s)
+        usual = usual_steps(step)
+        longer = step - usual
+        for k in np.flatnonzero((longer > _LEAST_EXCESS * usual) & (longer > _SHORTEST_S) & (longer < LONGEST_LAG_S)):
+            found.append(ClockJump((sensor,), float(record.time_s[k] + 0.5 * step[k]), float(longer[k])))
+    out: list[ClockJump] = []
+    for gap in sorted(found, key=lambda g: g.at_s):
+        last = out[-1] if out else None
+        if last is not None and gap.at_s - last.at_s < 0.5 * min(gap.by_s, last.by_s) and gap.sensors != last.sensors:
+            out[-1] = last._replace(sensors=(0, 1), by_s=0.5 * (last.by_s + gap.by_s))
+        else:
+            out.append(gap)
+    longest = sorted(out, key=lambda g: -g.by_s)[:_MOST_GAPS]
+    return sorted(longest, key=lambda g: g.at_s)
+
+
+def with_corrected_tags(record: TriadRecord, sensor: int, jumps: tuple[ClockJump, ...]) -> TriadRecord:
+    """Record whose tags are corrected beyond its jumps."""
+    t = record.time_s.copy()
+    for jump in (j for j in jumps if sensor in j.sensors):
+        later = record.time_s > jump.at_s
+        t += np.where(later, -jump.by_s, 0.0) if jump.after else np.where(later, 0.0, jump.by_s)
+    return replace(record, time_s=t)
+
+
+def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Issue]:
+    """One finding for each sensor and jump."""
+    out = []
+    for jump in jumps:
+        remark = f"time tags jump {1e3 * jump.by_s:.1f} ms ahead while no sample is missing: those "
+        remark += "after it were set back" if jump.after else "before it were set forward"
+        span = jump.at_s - 0.5 * jump.by_s, jump.at_s + 0.5 * jump.by_s
+        out += [Issue(remark, "clock-jump", names[sensor], *span) for sensor in jump.sensors]
+    return out

@@ -38,7 +38,7 @@ from flightmodel import tables
 from flightmodel.checks import FloatArray, GateError, Progress
 from flightmodel.instruments import ACCELEROMETER, RATES, BarometerSpec, GnssSpec, InstrumentSpec, RadarSite, table_of
 from flightmodel.telemetry import Telemetry
-from recon import estimate, kalman, single_faults
+from recon import estimate, kalman
 from recon.estimate import Linearised
 from recon.settings import Settings
 
@@ -257,7 +257,7 @@ class _Likelihood:
         """Log likelihood of the innovations."""
         problem = self.about.problem_of(_with(self.telemetry, self.places, logs), self.settings)
         run = kalman.forward(problem, self.about.states, self.settings.engine)
-        return single_faults.log_likelihood(problem, run)[0]
+        return kalman.log_likelihood(problem, run)[0]
 
     def cost(self, logs: FloatArray) -> float:
         """Minus the log posterior."""

@@ -42,9 +42,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flightmodel.checks import BoolArray, Check, FloatArray
+from flightmodel.statistics import ACCEPTED_ODDS
 from flightmodel.trajectory import interpolate_rows
 from flightmodel.vehicle import Vehicle
-from recon.fault_detection import LOG_LIKELIHOOD_LIMIT
 from recon.imu_screening import BridgedSensor
 from recon.time_bias import CORRELATION_S, SLOWEST_S, has_gap, smoothed_body_axes
 
@@ -203,7 +203,7 @@ def oscillation(
     roll_sd = float(np.hypot(roll_sd, clocks_s * per_lag / (2.0 * LAG_STEP_S)))
     roll = _with_positive(at_none, use, phases[0] + roll, aft)
     kind = max(gains, key=lambda name: gains[name])
-    if gains[kind] < LOG_LIKELIHOOD_LIMIT or (kind == ROLL and abs(roll) < max(_LEAST_ROLL_RAD, _ROLL_SD * roll_sd)):
+    if gains[kind] < ACCEPTED_ODDS or (kind == ROLL and abs(roll) < max(_LEAST_ROLL_RAD, _ROLL_SD * roll_sd)):
         kind = DELIVERED
     if kind == DELIVERED and abs(roll) > 0.5 * np.pi:
         kind = ROLL  # half a turn: the rest is as small, but the force has the wrong sign
@@ -341,6 +341,6 @@ def axes_check(found: Oscillation, force: BridgedSensor, rate: BridgedSensor) ->
         bad = f"{force.spec.name} is turned {turned:+.1f} ± {np.rad2deg(found.roll_sd_rad):.1f} deg about roll against "
         bad += rate.spec.name
         advice = "check the mount and the column order of both"
-    value = max(found.gain, LOG_LIKELIHOOD_LIMIT + 1.0) if off else 0.0
-    limits, kind = (0.0, LOG_LIKELIHOOD_LIMIT), found.kind
+    value = max(found.gain, ACCEPTED_ODDS + 1.0) if off else 0.0
+    limits, kind = (0.0, ACCEPTED_ODDS), found.kind
     return Check.of("triads-axes", f"axes of {names}", value, *limits, good, bad, advice=advice, component=kind)

@@ -28,13 +28,13 @@ import pandas as pd
 from flightmodel.checks import Check, GateError, Issue, Progress
 from flightmodel.telemetry import Telemetry
 from flightmodel.trajectory import Trajectory, difference, resample
-from recon import fault_isolation, first_passes, kalman, rest, setup, single_faults, survey, tracker_time
+from recon import fault_isolation, first_passes, hypotheses, kalman, rest, setup, survey, tracker_time
 from recon.estimate import TrajectorySolution, bridge_inertial_sensors, estimate, trackers
 from recon.fault_detection import UNMODELLED_CODE
 from recon.fault_isolation import INFLATION, Adaptation
+from recon.hypotheses import Explanation, Hypothesis
 from recon.problem import Problem
 from recon.settings import Settings
-from recon.single_faults import Single, SingleFault
 from recon.state import States
 
 _LEAVE_ONE_OUT_RATE_HZ = 5.0  # of the trajectories in which one tracker is left out
@@ -70,7 +70,7 @@ class Assessed:
     case: Case
     solution: TrajectorySolution
     at_rest: Adaptation
-    faults: tuple[SingleFault, ...]
+    faults: tuple[Explanation, ...]
 
 
 @dataclass(frozen=True)
@@ -177,11 +177,11 @@ def inertial_clock(now: Assessed, _report: Progress) -> Change | None:
     if lag is None or not faults or abs(lag.lag_s) < _LINEAR_LAG_S:
         return None
     name = faults[0].sources[0]
-    one = next(c for c in single_faults.corrections(telemetry, swings, lag) if c.sources == (name,))
+    one = next(c for c in hypotheses.corrections(telemetry, swings, lag) if c.sources == (name,))
     # which of the two it is may be open: then both may still be off by all of it
-    sure = len(single_faults.likeliest(faults)) == 1
+    sure = len(hypotheses.likeliest(faults)) == 1
     wide_s = INFLATION * (lag.sd_s if sure else abs(lag.lag_s))
-    known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in single_faults.TRIADS})
+    known = Adaptation(inflated_sd={f"{triad} time bias": wide_s for triad in hypotheses.TRIADS})
     words = f"{one.words.partition(': ')[2]}: corrected"
 
     def selected(again: TrajectorySolution) -> TrajectorySolution:
@@ -301,46 +301,46 @@ def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[Check]:
     return rest.rest_checks(telemetry, settings.check_confidence, points[0]) if len(points) else []
 
 
-def _single_faults(case: Case, solution: TrajectorySolution, report: Progress) -> tuple[SingleFault, ...]:
-    """Single hypotheses where a check fails, likeliest first; of both triads where their oscillation shows it."""
+def _single_faults(case: Case, solution: TrajectorySolution, report: Progress) -> tuple[Explanation, ...]:
+    """Hypothesis hypotheses where a check fails, likeliest first; of both triads where their oscillation shows it."""
     of_readings = fault_isolation.ABOUT_DECELERATION
     if all(check.passed or check.code in of_readings for check in solution.consistency_checks):
         return ()
     report(0.5, "trying single faults")
     telemetry, settings = case.telemetry, case.settings
     known, swings = solution.adaptation, solution.adaptation.oscillation
-    candidates = by_oscillation = single_faults.corrections(telemetry, swings, known.lag)
+    candidates = by_oscillation = hypotheses.corrections(telemetry, swings, known.lag)
     if not by_oscillation:
         prior_sd = dict(zip(solution.sensor_errors.name, solution.sensor_errors.prior_sd, strict=True))
-        candidates = single_faults.singles(telemetry, trackers(telemetry, settings), prior_sd)
+        candidates = hypotheses.hypotheses_of(telemetry, trackers(telemetry, settings), prior_sd)
     coarse = replace(settings, output_rate_hz=min(settings.output_rate_hz, 1.0), pulse_rate_hz=0.0)
     try:
         as_stated = _coarse_problem(telemetry, coarse, known)
 
-        def filtered(one: Single) -> tuple[Problem, kalman.ForwardPass, States]:
+        def filtered(one: Hypothesis) -> tuple[Problem, kalman.ForwardPass, States]:
             # most hypotheses are of the data as delivered, whose screening and integration take the time
             problem = as_stated if one.telemetry is telemetry else _coarse_problem(one.telemetry, coarse, known)
             problem = fault_isolation.with_inflated_priors(problem, one.inflated_sd)
-            thinned, _ = single_faults.with_noise(problem, one.noisier).thinned(first_passes.THINNED_STEP_S)
+            thinned, _ = hypotheses.with_noise(problem, one.noisier).thinned(first_passes.THINNED_STEP_S)
             return first_passes.converged(thinned, coarse.engine)
 
-        stated, _ = single_faults.log_likelihood(*filtered(Single("", "", (), telemetry))[:2])
+        stated, _ = kalman.log_likelihood(*filtered(Hypothesis("", "", (), telemetry))[:2])
     except GateError:
         return ()
-    found: list[SingleFault] = []
+    found: list[Explanation] = []
     if not np.isfinite(stated):
         return ()
     for one in candidates:
         try:
-            likelihood, misfit = single_faults.log_likelihood(*filtered(one)[:2])
+            likelihood, misfit = kalman.log_likelihood(*filtered(one)[:2])
         except GateError:
             continue
-        found.append(SingleFault(one.code, one.words, one.sources, likelihood - stated, misfit))
+        found.append(Explanation(one.code, one.words, one.sources, likelihood - stated, misfit))
     if not by_oscillation:
         found += tracker_time.late_trackers(telemetry, settings.without, filtered)
     # what the oscillation has shown needs no other proof: the trackers only say which of the two it is
     shown = known.lag is not None or (bool(found) and found[0].code == "triads-axes")
-    return single_faults.ranked(found, shown)
+    return hypotheses.ranked(found, shown)
 
 
 def _coarse_problem(telemetry: Telemetry, coarse: Settings, known: Adaptation) -> Problem:

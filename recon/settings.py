@@ -15,7 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictS
 from flightmodel.checks import ConfigError, Issue, nearest_name
 from flightmodel.tables import ordered_spans
 
-COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.kalman` and `recon.smoother`
+COMPILED, FILTERPY = ENGINES = ("compiled", "filterpy")  # of `recon.kalman`
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # whole ones too, but no text and no true or false
 Whole = Annotated[Number, Field(multiple_of=1.0), AfterValidator(int)]
 Rate = Annotated[Number, Field(ge=0.1, le=1000.0)]

@@ -23,10 +23,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from flightmodel import rotations
 from flightmodel.atmosphere import DENSITY_LENGTH_M, WIND_LENGTH_M
-from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray, nearest_name
+from flightmodel.checks import BoolArray, Check, FloatArray, GateError, IntArray, nearest_name
 from flightmodel.instruments import (
     ACCELEROMETER,
     RATES,
@@ -50,6 +51,7 @@ DRIVERS = (
 )  # fmt: skip
 Spec = TriadSpec | RadarSite | SitesSpec | GnssSpec | BarometerSpec | SunHeads
 AXES = ("x", "y", "z")
+MOST_KEPT_SD = 0.98  # of the a priori sd: an error that keeps more of it was not observable
 
 
 @dataclass(frozen=True)
@@ -303,3 +305,33 @@ def ballistic_blocks(motion: MotionSpec) -> list[Block]:
         Block("air", ("density",), "sd", 1.0, altitude_m=DENSITY_LENGTH_M),
         Block("air", ("wind north", "wind east"), "sd", 1.0, altitude_m=WIND_LENGTH_M),
     ]
+
+
+def data_sheet_check(
+    code: str,
+    label: str,
+    source: str,
+    components: list[str],
+    estimate: FloatArray,
+    prior_sd: FloatArray,
+    sd: FloatArray,
+    confidence: float,
+    bad: str = "is larger than the data sheet allows: check mounting, units and calibration",
+    good: str = "estimated sensor errors are consistent with the data sheet; largest:",
+) -> Check | None:
+    """Largest normalised shift (k,) of a priori errors of one source from zero; None where no error was observable.
+
+    The remark names the ``components`` entry that moved most: ``bad`` follows its name, ``good`` goes before it.
+    """
+    observable = sd < MOST_KEPT_SD * prior_sd
+    if not observable.any():
+        return None
+    shift = np.abs(estimate[observable]) / np.sqrt(prior_sd[observable] ** 2 - sd[observable] ** 2)
+    tail = 0.5 * (1.0 - confidence) / int(observable.sum())
+    worst = str(np.array(components, dtype=object)[observable][int(np.argmax(shift))])
+    name = f"{source} {worst}".strip()
+    symptom, _, advice = bad.partition(": ")
+    return Check.of(
+        code, label, float(shift.max()), 0.0, float(-ndtri(tail)), f"{good} {name}, {shift.max():.1f} sd",
+        f"{name} {symptom}", advice=advice, source=source, component=worst,
+    )  # fmt: skip

@@ -27,11 +27,10 @@ from flightmodel.checks import Check, FloatArray, Issue
 from flightmodel.statistics import chi_square_quantile
 from flightmodel.telemetry import KnownPlace, Telemetry
 from flightmodel.trajectory import nearest_index
-from recon.kalman import ForwardPass
+from recon.kalman import ForwardPass, smoothed_covariance
 from recon.measurements import SITES
 from recon.problem import Problem
 from recon.settings import Settings
-from recon.smoother import smoothed_covariance
 from recon.state import KINEMATIC, States
 
 _UNITS = {"m": ("m", 1.0), "rad": ("deg", float(np.rad2deg(1.0)))}

@@ -1,6 +1,6 @@
-"""Do the clocks of accelerometer and gyros agree, and did one of them jump? Time biases of the inertial sensors.
+"""Do the clocks of accelerometer and gyros agree? Their lag, by the oscillation of the vehicle.
 
-**Lag.** The flow's force on an oscillating vehicle and its moment act at the same instant: normal to the long axis
+The flow's force on an oscillating vehicle and its moment act at the same instant: normal to the long axis
 (body x) specific force and angular acceleration are in phase, each plane with a factor of its own that varies slowly
 with pressure. What lever arms add, ``w' x r`` and ``w x (w x r)``, is in phase as well. All of this is the same with
 time reversed; damping is not: it lets the force lag by about as long as the flow takes from the c.g. to where damping
@@ -12,12 +12,6 @@ arises, for which `_ARM_M` over the speed is the standard deviation. So in windo
 and the same of ``f_z`` with ``w_y'`` and ``w_x w_z``, fit best where the lag is by how much the tags of the force are
 later than the rates'. A window counts where the fit explains the force; the answer is the weighted median of all. No
 tracker takes part.
-
-**Jumps.** A clock that jumps ahead leaves a gap like any other, but behind it all tags are late by the gap (or all
-before it were early, where the clock was set right). For each short gap the trackers give the likelihood of so late a
-clock from there on against that of none (`recon.fault_detection`, with the clock's column in place of a bias's), and
-the lags before and after give that of one clock against the other. Where both together exceed a thousand to one, the
-tags are corrected.
 """
 
 from __future__ import annotations
@@ -28,26 +22,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from flightmodel.checks import BoolArray, Check, FloatArray, Issue
+from flightmodel.checks import BoolArray, Check, FloatArray
 from flightmodel.statistics import NORMAL_MAD
-from flightmodel.telemetry import TriadRecord
 from flightmodel.trajectory import interpolate_rows
-from recon.fault_detection import LOG_LIKELIHOOD_LIMIT, offset_scores
-from recon.imu_screening import BridgedSensor, usual_steps
-from recon.kalman import ForwardPass
+from recon.imu_screening import LONGEST_LAG_S, BridgedSensor
 from recon.problem import Problem
 from recon.state import KINEMATIC, States
 
 _WINDOW_S, _STEP_S = 4.0, 0.01  # some periods of the oscillation; a fortieth of one at 2.5 Hz
 _SMOOTH_S, SLOWEST_S = 0.04, 0.05  # of the Gaussian filter of both signals; steps of a record too slow to use
-_LONGEST_LAG_S, _LAG_STEP_S = 0.08, 0.01  # a fifth of a period at 2.5 Hz: a longer one is found by `recon.oscillation`
+_LAG_STEP_S = 0.01
 _LEAST_EXPLAINED = 0.95  # share of the lateral force's square
 CORRELATION_S = 0.7  # of residuals
 _LEAST_WINDOWS = 4  # so that their scatter says how well the lag is known
 _ARM_M = 3.0  # of a vehicle of six metres
-_SHORTEST_S = 0.004  # that a step is longer than usual: below it the lag cannot be measured
-_LEAST_EXCESS = 0.5  # of a usual step that a step is longer
-_MOST_GAPS = 8  # that are tested, the longest
 
 
 class Lag(NamedTuple):
@@ -70,8 +58,8 @@ def lag_between(
 
     ``path`` at ``time_s`` (n,) is where the vehicle flew, roughly; the lag is searched ``about_s``.
     """
-    start = max(start_s, float(force.time_s[0]), float(rate.time_s[0]) + about_s) + _LONGEST_LAG_S
-    end = min(end_s, float(force.time_s[-1]), float(rate.time_s[-1]) + about_s) - _LONGEST_LAG_S
+    start = max(start_s, float(force.time_s[0]), float(rate.time_s[0]) + about_s) + LONGEST_LAG_S
+    end = min(end_s, float(force.time_s[-1]), float(rate.time_s[-1]) + about_s) - LONGEST_LAG_S
     if max(np.median(np.diff(t.time_s)) for t in (force, rate)) > SLOWEST_S or end - start < _WINDOW_S:
         return None
     lags_found = []
@@ -82,14 +70,14 @@ def lag_between(
         if has_gap(force, begin) or has_gap(rate, begin):
             continue
         at = begin + np.arange(0.0, _WINDOW_S, _STEP_S)
-        lags = about_s + np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1e-9, _LAG_STEP_S)
+        lags = about_s + np.arange(-LONGEST_LAG_S, LONGEST_LAG_S + 1e-9, _LAG_STEP_S)
         shifted = interpolate_rows((at - lags[:, None]).ravel(), wt, turning).reshape(len(lags), len(at), -1)
         damping = _ARM_M / max(float(np.interp(begin + 0.5 * _WINDOW_S, time_s, speed)), 1.0)
         both = (_lag_in_window(interpolate_rows(at, ft, f)[:, i], shifted, lags, i) for i in (1, 2))
         lags_found += [(*one, damping) for one in both if one is not None]
     lag = _combined(np.array(lags_found)) if len(lags_found) >= _LEAST_WINDOWS else None
     # else hardly any lag in the range would be significant
-    return lag if lag is not None and lag.sd_s < _LONGEST_LAG_S / 10.0 else None
+    return lag if lag is not None and lag.sd_s < LONGEST_LAG_S / 10.0 else None
 
 
 def smoothed_body_axes(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +92,7 @@ def smoothed_body_axes(sensor: BridgedSensor) -> tuple[FloatArray, FloatArray]:
 
 def has_gap(sensor: BridgedSensor, begin: float) -> bool:
     """Whether a sensor has a gap in, or near, the window from ``begin`` on."""
-    a, b = np.searchsorted(sensor.time_s, [begin - _LONGEST_LAG_S, begin + _WINDOW_S + _LONGEST_LAG_S])
+    a, b = np.searchsorted(sensor.time_s, [begin - LONGEST_LAG_S, begin + _WINDOW_S + LONGEST_LAG_S])
     gaps: BoolArray = sensor.in_gap[max(a - 1, 0) : b]
     return bool(gaps.any())
 
@@ -173,118 +161,3 @@ def with_lag(problem: Problem, lag: Lag | None, force: str, rate: str) -> Proble
     moved = gain * (lag.lag_s - h[KINEMATIC:] @ errors)
     start = replace(problem.start, sensor_errors=errors + moved[KINEMATIC:])
     return replace(problem, start=start, start_covariance=p - np.outer(gain, h @ p))
-
-
-class ClockJump(NamedTuple):
-    """Tags that jump ahead ``by_s`` at ``at_s``, mid-gap; late ones come ``after`` it, or early ones before.
-
-    ``sensors`` that jump together: 0 the accelerometer, 1 the gyros.
-    """
-
-    sensors: tuple[int, ...]
-    at_s: float
-    by_s: float
-    after: bool = True
-
-
-def jumps_of_clocks(
-    problem: Problem,
-    run: ForwardPass,
-    records: tuple[TriadRecord, TriadRecord],
-    sensors: tuple[BridgedSensor, BridgedSensor],
-) -> tuple[ClockJump, ...]:
-    """Gaps that are jumps of a clock, in order of time.
-
-    Parameters
-    ----------
-    problem : Problem
-    run : ForwardPass
-        Made with all tags as delivered.
-    records, sensors : (accelerometer, gyros)
-        As delivered, and as the run took them.
-    """
-    gaps = [g for g in _gaps(records) if problem.time_s[0] < g.at_s < problem.time_s[-1] - g.by_s]
-    log_ratio, path = _by_trackers(problem, run, gaps), run.states()
-    edges = [-np.inf, *(g.at_s for g in gaps), np.inf]
-    out = []
-    for k, gap in enumerate(gaps):
-        likely = log_ratio[k] + _by_lags(gap, edges[k], edges[k + 2], sensors, path, problem.time_s)
-        if likely.max() > LOG_LIKELIHOOD_LIMIT:
-            out.append(gap._replace(after=bool(likely[0] >= likely[1])))
-    return tuple(out)
-
-
-def with_corrected_tags(record: TriadRecord, sensor: int, jumps: tuple[ClockJump, ...]) -> TriadRecord:
-    """Record whose tags are corrected beyond its jumps."""
-    t = record.time_s.copy()
-    for jump in (j for j in jumps if sensor in j.sensors):
-        later = record.time_s > jump.at_s
-        t += np.where(later, -jump.by_s, 0.0) if jump.after else np.where(later, 0.0, jump.by_s)
-    return replace(record, time_s=t)
-
-
-def jump_findings(jumps: tuple[ClockJump, ...], names: tuple[str, str]) -> list[Issue]:
-    """One finding for each sensor and jump."""
-    out = []
-    for jump in jumps:
-        remark = f"time tags jump {1e3 * jump.by_s:.1f} ms ahead while no sample is missing: those "
-        remark += "after it were set back" if jump.after else "before it were set forward"
-        span = jump.at_s - 0.5 * jump.by_s, jump.at_s + 0.5 * jump.by_s
-        out += [Issue(remark, "clock-jump", names[sensor], *span) for sensor in jump.sensors]
-    return out
-
-
-def _gaps(records: tuple[TriadRecord, TriadRecord]) -> list[ClockJump]:
-    """Short gaps of either sensor or, at one time, of both."""
-    found = []
-    for sensor, record in enumerate(records):
-        step = np.diff(record.time_s)
-        usual = usual_steps(step)
-        longer = step - usual
-        for k in np.flatnonzero((longer > _LEAST_EXCESS * usual) & (longer > _SHORTEST_S) & (longer < _LONGEST_LAG_S)):
-            found.append(ClockJump((sensor,), float(record.time_s[k] + 0.5 * step[k]), float(longer[k])))
-    out: list[ClockJump] = []
-    for gap in sorted(found, key=lambda g: g.at_s):
-        last = out[-1] if out else None
-        if last is not None and gap.at_s - last.at_s < 0.5 * min(gap.by_s, last.by_s) and gap.sensors != last.sensors:
-            out[-1] = last._replace(sensors=(0, 1), by_s=0.5 * (last.by_s + gap.by_s))
-        else:
-            out.append(gap)
-    longest = sorted(out, key=lambda g: -g.by_s)[:_MOST_GAPS]
-    return sorted(longest, key=lambda g: g.at_s)
-
-
-def _by_trackers(problem: Problem, run: ForwardPass, gaps: list[ClockJump]) -> FloatArray:
-    """Logarithm of the likelihood (g, 2) of late tags after, and of early ones before each gap, against neither."""
-    out = np.zeros((len(gaps), 2))
-    if not gaps or not problem.motion.clocks or problem.model.wander.considered.any():
-        return out
-    columns = KINEMATIC + np.array([18, 19])
-    nodes = np.searchsorted(problem.time_s, [g.at_s for g in gaps]).astype(np.int64)
-    first, last = np.zeros_like(nodes), np.full_like(nodes, len(problem.time_s) - 1)
-    both = (offset_scores(problem, run, nodes, last, columns), offset_scores(problem, run, first, nodes, columns))
-    for side, (sign, (score, variance)) in enumerate(zip((1.0, -1.0), both, strict=True)):
-        for k, gap in enumerate(gaps):
-            offset = np.zeros(2)
-            offset[list(gap.sensors)] = sign * gap.by_s
-            out[k, side] = -score[k] @ offset - 0.5 * offset @ variance[k] @ offset
-    return out
-
-
-def _by_lags(
-    gap: ClockJump,
-    from_s: float,
-    to_s: float,
-    sensors: tuple[BridgedSensor, BridgedSensor],
-    path: States,
-    time_s: FloatArray,
-) -> float:
-    """Logarithm of the likelihood that one clock jumped against the other, over that of none."""
-    if len(gap.sensors) > 1:
-        return 0.0
-    before = lag_between(*sensors, path, time_s, from_s, gap.at_s - gap.by_s)
-    after = lag_between(*sensors, path, time_s, gap.at_s + gap.by_s, to_s)
-    if before is None or after is None:
-        return 0.0
-    jumped = gap.by_s if gap.sensors == (0,) else -gap.by_s
-    return ((after.lag_s - before.lag_s) * jumped - 0.5 * jumped**2) / (after.sd_s**2 + before.sd_s**2)

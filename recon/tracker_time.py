@@ -24,9 +24,9 @@ from scipy.special import ndtri
 
 from flightmodel.checks import Check, FloatArray, GateError, Issue
 from flightmodel.telemetry import Telemetry
-from recon.kalman import ForwardPass
+from recon.hypotheses import Explanation, Hypothesis
+from recon.kalman import ForwardPass, log_likelihood
 from recon.problem import Problem
-from recon.single_faults import Single, SingleFault, log_likelihood
 from recon.state import States
 
 _STEP_S, _FARTHEST_S = 1.0, 10.0  # of a climb; the filter finds the way from as far
@@ -34,7 +34,7 @@ _WIDE_S = 0.5  # a priori sd of what a shift leaves
 _LEAST_GAIN = 1.0  # of log likelihood, that a step is taken
 _LEAST_LAG_S = 0.1  # below it the error state serves, with a wider prior
 _LARGE_S, _KNOWN_SD = 0.25, 5.0  # from here on third order counts; an estimate that is not its prior's
-Filtered = Callable[[Single], tuple[Problem, ForwardPass, States]]
+Filtered = Callable[[Hypothesis], tuple[Problem, ForwardPass, States]]
 
 
 class _Tried(NamedTuple):
@@ -59,19 +59,19 @@ def with_earlier_tags(telemetry: Telemetry, late_s: Mapping[str, float]) -> Tele
     return replace(telemetry, radars=shifted(telemetry.radars), gnss=shifted(telemetry.gnss))
 
 
-def late_trackers(telemetry: Telemetry, without: tuple[str, ...], filtered: Filtered) -> list[SingleFault]:
+def late_trackers(telemetry: Telemetry, without: tuple[str, ...], filtered: Filtered) -> list[Explanation]:
     """Hypotheses that the tags of one tracker, or of all, are late; ``filtered`` runs the filter on thinned data."""
     names = tuple(name for name in _tracks(telemetry) if name not in without)
     if telemetry.motion.model == "ballistic" or not names:
         return []
-    stated = _over_noise(*filtered(Single("", "", (), telemetry))[:2])[0]
+    stated = _over_noise(*filtered(Hypothesis("", "", (), telemetry))[:2])[0]
     out = []
     for group in dict.fromkeys([*((name,) for name in names), names]):
         found = _climbed(lambda late_s, group=group: _tried(telemetry, group, late_s, filtered))  # type: ignore[misc]
         if found is not None:
             late_s = found.late_s + found.rest_s
             words = f"{' and '.join(group)}: time tags {_in_words(late_s)}"
-            out.append(SingleFault("time-bias", words, group, found.gain - stated, found.misfit, late_s))
+            out.append(Explanation("time-bias", words, group, found.gain - stated, found.misfit, late_s))
     return out
 
 
@@ -97,7 +97,7 @@ def _climbed(tried: Callable[[float], _Tried | None]) -> _Tried | None:
 def _tried(telemetry: Telemetry, names: tuple[str, ...], late_s: float, filtered: Filtered) -> _Tried | None:
     shifted = with_earlier_tags(telemetry, dict.fromkeys(names, late_s))
     try:
-        problem, run, states = filtered(Single("", "", names, shifted))
+        problem, run, states = filtered(Hypothesis("", "", names, shifted))
     except GateError:
         return None
     gain, misfit = _over_noise(problem, run)
@@ -112,7 +112,7 @@ def _over_noise(problem: Problem, run: ForwardPass) -> tuple[float, float]:
     return likelihood + 0.5 * float(np.log(variance[np.isfinite(variance)]).sum()), misfit
 
 
-def lags(telemetry: Telemetry, faults: tuple[SingleFault, ...], sensor_errors: pd.DataFrame) -> dict[str, float]:
+def lags(telemetry: Telemetry, faults: tuple[Explanation, ...], sensor_errors: pd.DataFrame) -> dict[str, float]:
     """Corrections of trackers' tags, s: the lag that explains failed checks best, if the best explanation is a lag.
 
     Without such an explanation of anything, time biases that are known and too large for the series about them.

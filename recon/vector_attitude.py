@@ -42,7 +42,7 @@ from recon.attitude_smoother import (
     solve_vectors,
     unit,
 )
-from recon.consistency import data_sheet_check
+from recon.state import data_sheet_check
 
 _BLIND_RAD = 0.3  # a single attitude with an angle as uncertain as this starts nothing
 _START_SPAN_S = 60.0  # longer, and constant errors were known better; attitude and rate follow within seconds

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from recon.kalman import Smoothed, keep_moments
 from recon.linearise import full_step, measured_rows
-from recon.smoother import Smoothed, keep_moments
 from recon.state import unpacked
 
 
@@ -30,7 +30,7 @@ def _before(observed, slots, readings, innovations, row, mean, information):
 
 
 def bryson_frazier(steps, run, observed, slots, readings, innovations, x, triangles, variance):
-    """Smoothed errors ``x`` (n, N) in place, and moments at kept nodes, as `recon.smoother.rauch_tung_striebel`."""
+    """Smoothed errors ``x`` (n, N) in place, and moments at kept nodes, as `recon.kalman.rauch_tung_striebel`."""
     n, size = x.shape
     mean, information = np.zeros(size), np.zeros((size, size))
     for k in reversed(range(n)):

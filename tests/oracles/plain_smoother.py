@@ -1,9 +1,9 @@
-"""Rauch-Tung-Striebel's smoother in numpy: readable twin of `recon.smoother.rauch_tung_striebel`."""
+"""Rauch-Tung-Striebel's smoother in numpy: readable twin of `recon.kalman.rauch_tung_striebel`."""
 
 import numpy as np
 
+from recon.kalman import keep_moments
 from recon.linearise import full_step
-from recon.smoother import keep_moments
 from recon.state import unpacked
 
 

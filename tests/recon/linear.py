@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon import kalman, smoother
+from recon import kalman
 from recon.kalman import Filtered, Innovations
 from recon.linearise import Readings, Steps, full_step
 from recon.measurements import SLOTS
@@ -100,7 +100,7 @@ def smooth(problem, out, innovations, method):
     triangles, variance = np.empty_like(out.p_plus), np.empty((n, size))
     if method == "two-filter":
         x = out.x_minus.copy()
-        smoother.two_filter(
+        kalman.two_filter(
             problem.steps, out, problem.observed, problem.slots, problem.readings, innovations, problem.considered, x,
             triangles, variance,
         )  # fmt: skip
@@ -111,7 +111,7 @@ def smooth(problem, out, innovations, method):
         )
     else:
         x = out.x_plus.copy()
-        one = plain_smoother if method.startswith("plain") else smoother
+        one = plain_smoother if method.startswith("plain") else kalman
         one.rauch_tung_striebel(problem.steps, out, problem.moving, x, triangles, variance)
     return x, triangles, variance
 

@@ -6,9 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from recon.kalman import forward
+from recon.kalman import forward, smooth
 from recon.settings import ENGINES
-from recon.smoother import smooth
 from recon.state import unpacked
 
 from . import linear

@@ -7,11 +7,10 @@ import pytest
 
 from flightmodel import rotations
 from flightmodel.telemetry import RadarRecord
-from recon.kalman import forward
+from recon.kalman import forward, smooth, smoothed_covariance
 from recon.linearise import as_charts, full_step
 from recon.measurements import wrapped
 from recon.settings import ENGINES, FILTERPY
-from recon.smoother import smooth, smoothed_covariance
 from recon.state import boxminus, boxplus, packed, unpacked
 from tests.oracles.plain_measurements import NodeMotion, predict
 

@@ -8,11 +8,11 @@ from scipy.spatial.transform import Rotation
 
 from flightmodel.vehicle import vehicle_from_toml, vehicle_path
 from recon.fault_isolation import isolate_faults
+from recon.hypotheses import Explanation, corrections, likeliest, ranked
 from recon.imu_screening import bridge
 from recon.oscillation import DELIVERED, LAG, MIRRORED, ROLL, axes_check, common_angle, oscillation
 from recon.reconstruct import reconstruct
 from recon.settings import Settings
-from recon.single_faults import SingleFault, corrections, likeliest, ranked
 from tests.recon.test_time_bias import swinging
 
 VEHICLE = vehicle_from_toml(vehicle_path("irve2_reference"))
@@ -138,7 +138,7 @@ def test_nothing_is_said_of_a_body_that_is_not_known_or_does_not_swing():
 
 def test_only_what_explains_the_flight_is_ranked_and_each_source_once():
     kinds = [("a", 50.0, 1.0), ("a", 60.0, 1.0), ("b", 59.0, 1.1), ("c", 99.0, 3.0), ("d", 2.0, 1.0)]
-    order = ranked([SingleFault("code", name, (name,), gain, misfit) for name, gain, misfit in kinds])
+    order = ranked([Explanation("code", name, (name,), gain, misfit) for name, gain, misfit in kinds])
     assert [(f.sources, f.gain) for f in order] == [(("a",), 60.0), (("b",), 59.0)]
     assert likeliest(order) == order
 

@@ -15,13 +15,12 @@ import pandas as pd
 import pytest
 
 from flightmodel import earth
-from recon.kalman import forward
+from recon.kalman import forward, smooth
 from recon.linearise import Steps
 from recon.measurements import HEIGHT, SLOTS, Instrument
 from recon.problem import Observed, Problem, observe
 from recon.propagation import propagate, strapdown_motion
 from recon.settings import ENGINES
-from recon.smoother import smooth
 from recon.state import Block, ErrorModel, States, Wander, unpacked
 from tests.oracles import bryson_frazier
 

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from flightmodel.instruments import GnssSpec
-from recon import fault_detection, smoother
-from recon.kalman import forward
+from recon import fault_detection, kalman
+from recon.kalman import forward, smooth
 from recon.linearise import full_step
 from recon.settings import ENGINES
-from recon.smoother import smooth
 from recon.state import unpacked
 from tests.oracles import bryson_frazier
 from tests.oracles.plain_smoother import rauch_tung_striebel, step_gain
@@ -150,7 +149,7 @@ def test_two_filters_equal_the_others_where_nothing_is_considered(flights, name)
     run = forward(problem)
     x, count = run.filtered.x_minus.copy(), int(problem.kept.sum())
     triangles, variance = np.empty((count, problem.dense * (problem.dense + 1) // 2)), np.empty((count, problem.size))
-    smoother.two_filter(
+    kalman.two_filter(
         run.steps, run.filtered, problem.observed, problem.sources().slot, run.readings, run.innovations,
         np.empty(0, dtype=np.int64), x, triangles, variance,
     )  # fmt: skip

@@ -9,10 +9,10 @@ from flightmodel.instruments import TriadSpec
 from flightmodel.telemetry import TriadRecord
 from recon import time_bias
 from recon.estimate import estimate
-from recon.imu_screening import bridge
+from recon.imu_screening import ClockJump, bridge, with_corrected_tags
 from recon.settings import Settings
 from recon.state import States
-from recon.time_bias import ClockJump, lag_between, with_corrected_tags
+from recon.time_bias import lag_between
 
 FINE_S, STEP_S, END_S, SPIN = 0.002, 0.005, 60.0, 0.6
 FORCE = TriadSpec("accelerometer", np.zeros(3), np.eye(3), 0.05, 0.1, 0.003, 0.002, time_bias_sd_s=0.001)

@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from recon.consistency import (
-    data_sheet_check,
     edit_check,
     held_out_checks,
     left_out_findings,
@@ -16,6 +15,7 @@ from recon.consistency import (
     whiteness_check,
 )
 from recon.settings import Settings
+from recon.state import data_sheet_check
 from tests.refusing import numbers_in
 
 DRAWS = 4000

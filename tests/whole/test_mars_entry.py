@@ -8,7 +8,7 @@ from flightmodel import earth
 from flightmodel.checks import ConfigError, DivergenceError, GateError
 from flightmodel.statistics import chi_square_quantile
 from postflight.run_folder import peak_table
-from recon import smoother
+from recon import kalman
 from tests.oracles import mars_entry
 from tests.refusing import numbers_in
 
@@ -371,7 +371,7 @@ def test_a_hypothesis_that_diverges_is_no_traceback(tmp_path, monkeypatch):
     """Of a deceleration of m/s^2 read as g, at 12.8 km/s on Earth, one of the single faults that are tried did."""
     truth = mars_entry.fly(914, to_s=80.0)
     flight = spoilt(truth, tmp_path, lambda rows: rows * [1.0, 3.0])
-    usual, calls = smoother.two_filter, []
+    usual, calls = kalman.two_filter, []
 
     def breaking(*given):
         calls.append(1)
@@ -379,7 +379,7 @@ def test_a_hypothesis_that_diverges_is_no_traceback(tmp_path, monkeypatch):
             raise np.linalg.LinAlgError
         return usual(*given)
 
-    monkeypatch.setattr(smoother, "two_filter", breaking)
+    monkeypatch.setattr(kalman, "two_filter", breaking)
     assert not all(check.passed for check in pf.reconstruct(flight).consistency_checks)
     assert len(calls) > 1
     with pytest.raises(DivergenceError) as diverged:

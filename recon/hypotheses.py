@@ -26,7 +26,6 @@ from flightmodel import earth, rotations
 from flightmodel.checks import FloatArray
 from flightmodel.instruments import RadarSite
 from flightmodel.telemetry import Telemetry, TriadRecord
-from recon.kalman import ForwardPass
 from recon.oscillation import MIRRORED, ROLL, Oscillation
 from recon.problem import Problem
 from recon.time_bias import Lag
@@ -50,7 +49,7 @@ _KINDS = {  # of a triad's errors, by the name that they have in the error model
 
 
 @dataclass(frozen=True)
-class Single:
+class Hypothesis:
     """One fault hypothesis: its words, and the telemetry with that fault corrected.
 
     Parameters
@@ -73,7 +72,7 @@ class Single:
 
 
 @dataclass(frozen=True)
-class SingleFault:
+class Explanation:
     """A hypothesis with its log likelihood over that of the flight as stated, and the innovations' mean square.
 
     ``late_s`` is by how much it sets tags of trackers back.
@@ -87,21 +86,6 @@ class SingleFault:
     late_s: float = 0.0
 
 
-def log_likelihood(problem: Problem, run: ForwardPass) -> tuple[float, float]:
-    """Log likelihood of all measurements that the filter was offered, up to a constant, and their mean square.
-
-    Of a filter that diverged it is minus infinity.
-    """
-    offered, found = problem.observed.usable, run.innovations
-    count = np.isfinite(problem.observed.variance).sum(axis=1)[offered]
-    nis, covariance = found.nis[offered], found.covariance[offered]
-    if not (np.isfinite(nis).all() and np.isfinite(covariance).all()):
-        return -np.inf, np.inf
-    size = np.minimum(nis, problem.gate[count])
-    _, log_det = np.linalg.slogdet(covariance)  # components that were not measured have unit variance there
-    return float(-0.5 * (size + log_det).sum()), float(size.sum() / max(count.sum(), 1))
-
-
 def with_noise(problem: Problem, noisier: dict[str, float]) -> Problem:
     """Problem in which instruments of these owners are noisier."""
     variance = problem.observed.variance.copy()
@@ -111,7 +95,7 @@ def with_noise(problem: Problem, noisier: dict[str, float]) -> Problem:
     return replace(problem, observed=problem.observed._replace(variance=variance))
 
 
-def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None) -> list[Single]:
+def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None) -> list[Hypothesis]:
     """Corrections of both triads according to the oscillation; empty if it shows no error."""
     force, rate = telemetry.accelerometer, telemetry.rates
     if force is None or rate is None:
@@ -139,11 +123,11 @@ def corrections(telemetry: Telemetry, found: Oscillation | None, lag: Lag | None
 
 def _of_either(
     code: str, words: list[str], telemetry: Telemetry, force: TriadRecord, rate: TriadRecord
-) -> list[Single]:
+) -> list[Hypothesis]:
     """Hypotheses that the one or the other triad is to be corrected."""
     return [
-        Single(code, words[0], (TRIADS[0],), replace(telemetry, accelerometer=force)),
-        Single(code, words[1], (TRIADS[1],), replace(telemetry, rates=rate)),
+        Hypothesis(code, words[0], (TRIADS[0],), replace(telemetry, accelerometer=force)),
+        Hypothesis(code, words[1], (TRIADS[1],), replace(telemetry, rates=rate)),
     ]
 
 
@@ -154,9 +138,9 @@ def _turned(record: TriadRecord, matrix: FloatArray) -> TriadRecord:
     return replace(record, measured_sensor=np.where(np.isfinite(measured), turned, np.nan))
 
 
-def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, float]) -> list[Single]:
+def hypotheses_of(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, float]) -> list[Hypothesis]:
     """Every single hypothesis of a flight; ``prior_sd`` is of its errors by name, owner first."""
-    out: list[Single] = []
+    out: list[Hypothesis] = []
     for triad in (telemetry.accelerometer, telemetry.rates):
         if triad is None:
             continue
@@ -164,26 +148,26 @@ def singles(telemetry: Telemetry, trackers: Iterable[str], prior_sd: dict[str, f
         for kind, code in _KINDS.items():
             wide = {k: WIDER * sd for k, sd in prior_sd.items() if k.startswith(f"{name} {kind}")}
             if wide:
-                out.append(Single(code, f"{name}: {kind}", (name,), telemetry, wide))
+                out.append(Hypothesis(code, f"{name}: {kind}", (name,), telemetry, wide))
     clocks = {f"{name} time bias": WIDER * prior_sd.get(f"{name} time bias", 0.0) for name in TRIADS}
     if any(clocks.values()):
-        out.append(Single("time-bias", "clock of both inertial sensors", TRIADS, telemetry, clocks))
+        out.append(Hypothesis("time-bias", "clock of both inertial sensors", TRIADS, telemetry, clocks))
     for name in trackers:
         own = {k: WIDER * sd for k, sd in prior_sd.items() if k.startswith(f"{name} ") and sd > 0.0}
         late = {k: sd for k, sd in own.items() if k == f"{name} time bias"}
         rest = {k: sd for k, sd in own.items() if k not in late}
         # beside inertial sensors `recon.tracker_time` tries the tags of radars and receivers
         if late and (telemetry.motion.model == "ballistic" or name in telemetry.barometers):
-            out.append(Single("time-bias", f"{name}: time bias", (name,), telemetry, late))
+            out.append(Hypothesis("time-bias", f"{name}: time bias", (name,), telemetry, late))
         if rest:
-            out.append(Single("tracker", f"{name}: site or calibration", (name,), telemetry, rest))
-        out.append(Single("tracker", f"{name}: noise", (name,), telemetry, noisier={name: _NOISIER}))
+            out.append(Hypothesis("tracker", f"{name}: site or calibration", (name,), telemetry, rest))
+        out.append(Hypothesis("tracker", f"{name}: noise", (name,), telemetry, noisier={name: _NOISIER}))
     if telemetry.radars:
         names = tuple(telemetry.radars)
         bent = _with_sites(telemetry, lambda site: replace(site, refraction_sd=1.0))
         slow = _with_sites(telemetry, _slower)
-        out.append(Single("refraction", "refraction of the radars", names, bent))
-        out.append(Single("servo-lag", "servo of the radars", names, slow))
+        out.append(Hypothesis("refraction", "refraction of the radars", names, bent))
+        out.append(Hypothesis("servo-lag", "servo of the radars", names, slow))
     return out + _attitudes(telemetry) + _slips(telemetry)
 
 
@@ -199,7 +183,7 @@ def _slower(site: RadarSite) -> RadarSite:
     return replace(site, angle_servo_hz=hz, servo_lag_sd=_SERVO_LAG_SD * (hz / _SERVO_HZ) ** 2)
 
 
-def _slips(telemetry: Telemetry) -> list[Single]:
+def _slips(telemetry: Telemetry) -> list[Hypothesis]:
     """Readings of a wrong unit, or of wrong sign about the long axis, which the oscillation does not show."""
     out = []
     for name, record in (("accelerometer", telemetry.accelerometer), ("rates", telemetry.rates)):
@@ -213,11 +197,11 @@ def _slips(telemetry: Telemetry) -> list[Single]:
             flight = (
                 replace(telemetry, accelerometer=changed) if name == TRIADS[0] else replace(telemetry, rates=changed)
             )
-            out.append(Single("units-and-signs", f"{name}: {words}", (name,), flight))
+            out.append(Hypothesis("units-and-signs", f"{name}: {words}", (name,), flight))
     return out
 
 
-def _attitudes(telemetry: Telemetry) -> list[Single]:
+def _attitudes(telemetry: Telemetry) -> list[Hypothesis]:
     """Another attitude prior, from four starts about roll."""
     prior = telemetry.attitude_prior
     if prior is None:
@@ -228,22 +212,22 @@ def _attitudes(telemetry: Telemetry) -> list[Single]:
         q = rotations.multiply(prior.q_ecef_body, np.array([np.cos(half), np.sin(half), 0.0, 0.0]))
         wide = replace(prior, q_ecef_body=q, sd_rad=np.maximum(prior.sd_rad, _PRIOR_SD_RAD))
         words = "attitude prior"
-        out.append(Single("attitude-prior", words, ("attitude_prior",), replace(telemetry, attitude_prior=wide)))
+        out.append(Hypothesis("attitude-prior", words, ("attitude_prior",), replace(telemetry, attitude_prior=wide)))
     return out
 
 
-def ranked(found: list[SingleFault], shown: bool = False) -> tuple[SingleFault, ...]:
+def ranked(found: list[Explanation], shown: bool = False) -> tuple[Explanation, ...]:
     """Hypotheses that explain the flight, the likeliest first, each source once.
 
     Where it is ``shown`` that one of them holds, none needs to be likelier than the flight as stated.
     """
-    out: dict[tuple[str, ...], SingleFault] = {}
+    out: dict[tuple[str, ...], Explanation] = {}
     for one in sorted(found, key=lambda f: -f.gain):
         if shown or (one.gain > _LEAST_GAIN and one.misfit < _LARGEST_MISFIT):
             out.setdefault(one.sources, one)
     return tuple(out.values())
 
 
-def likeliest(found: tuple[SingleFault, ...]) -> tuple[SingleFault, ...]:
+def likeliest(found: tuple[Explanation, ...]) -> tuple[Explanation, ...]:
     """The likeliest, and those that are hardly less likely."""
     return tuple(f for f in found if f.gain > found[0].gain - _ALSO)
