@@ -25,7 +25,7 @@ from recon.consistency import doubt
 
 if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
     from estimators.agreement import Agreement
-    from estimators.fusing import CameraTimeBias, FusedAnswer
+    from estimators.fusing import CameraTimeBias, Fused
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
 
@@ -50,7 +50,7 @@ class Deflections(Tabular):
         By method: ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"``.
     refused : dict of Issue
         Why a method gave none.
-    fused : FusedAnswer or None
+    fused : Fused or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
     camera : CameraAnswer or None
         What stands behind the camera's, of one camera or several.
@@ -68,7 +68,7 @@ class Deflections(Tabular):
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
     refused: dict[str, Issue] = field(default_factory=dict)
-    fused: FusedAnswer | None = None
+    fused: Fused | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     smooth_camera: DeflectionHistory | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
@@ -464,7 +464,7 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     return _increments(found.fused, bet)
 
 
-def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
+def _increments(fused: Fused, bet: Reconstruction) -> AeroIncrements:
     """Increments; if there are none and the film's clock is off, the error names the clock first."""
     from postflight.flown_coefficients import increments_of
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.fusing import FusedAnswer
+from estimators.fusing import Fused
 from estimators.loads import FlightLoads, lateral_and_size
 from flightmodel.airdata import AirData
 from flightmodel.checks import FloatArray, GateError
@@ -102,7 +102,7 @@ def history_of(figure: str, given: object, method: str) -> DeflectionHistory:
         raise GateError(f"{figure}: {fault.args[0]}", "input-missing") from None
 
 
-def fused_of(figure: str, given: object) -> FusedAnswer:
+def fused_of(figure: str, given: object) -> Fused:
     """Posterior behind the fused answer; `GateError` where there is none."""
     answers = given if isinstance(given, Deflections) else Deflections()
     if answers.fused is None:
