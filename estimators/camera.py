@@ -93,6 +93,8 @@ class FilmFit:
         Assumed plane; None: estimated in every frame.
     plane_sd_rad : float
         Of the assumed plane.
+    pressure_pa : (n,) float
+        Dynamic pressure at the frames; NaN where no trajectory gives it.
     edited : str
         What an analyst edited, and what was left out of every picture.
     shape_covariance : (13 (1 + c), 13 (1 + c)) float or None
@@ -105,6 +107,7 @@ class FilmFit:
     benchmark_s: float
     plane_lv_rad: float | None
     plane_sd_rad: float
+    pressure_pa: FloatArray
     edited: str = ""
     shape_covariance: FloatArray | None = None
 
@@ -336,7 +339,10 @@ def read_film(
     remarks = [f"by hand: {edits}"] if edits.rows else []
     if fixed is not None:
         remarks.append(f"text burnt into the film, or dead lines: {100.0 * fixed.mean():.0f} % of the picture left out")
-    return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, "; ".join(remarks))
+    unknown_pa = np.full(len(times), np.nan)
+    return FilmFit(
+        times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, unknown_pa, "; ".join(remarks)
+    )
 
 
 def has_texture(oriented: OrientedCamera) -> bool:

@@ -309,7 +309,7 @@ def _answered(
     camera: Task[CameraAnswer] | None = None
     time_bias: Task[CameraTimeBias | None] | None = None
     if film is not None:
-        camera = beside.submit("postflight.filming:answer_of_film", there, film)
+        camera = beside.submit("postflight.filming:camera_answer", there, film)
         if "fused" in methods:
             time_bias = beside.submit("postflight.filming:time_bias_of", there, camera)
     figures.draw("trajectory")  # which comes after the camera

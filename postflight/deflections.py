@@ -273,8 +273,8 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
 
     check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ}, {FILM} or {RECONSTRUCT}")
     if isinstance(flown, Flight):
-        return camera_answer(flown, None, progress).plain
-    return camera_answer(flown.flight, flown, progress).history
+        return camera_answer(flown, progress=progress).plain
+    return camera_answer(flown, progress=progress).history
 
 
 @on_one_thread
@@ -382,7 +382,7 @@ def estimate(
                 from postflight.filming import camera_answer, keep_oriented
 
                 shown = part_of(report, k / len(methods), (k + 1) / len(methods))
-                filmed = camera_answer(flight, bet, shown) if camera is None else camera.result()
+                filmed = camera_answer(bet or flight, progress=shown) if camera is None else camera.result()
                 keep_oriented(flight.telemetry, filmed.oriented)
                 history = filmed.history
             elif bet is None and loads is None:
