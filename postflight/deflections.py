@@ -367,63 +367,52 @@ def estimate(
     """
     report = progress or (lambda _fraction, _what: None)
     bet = flown if isinstance(flown, Reconstruction) else None
-    loads = flown if isinstance(flown, FlightLoads) else flown.loads if isinstance(flown, Flight) else None
     flight = flown if isinstance(flown, Flight) else None if bet is None else bet.flight
-    answers = Deflections(bet=bet, loads=loads)
+    histories: dict[str, DeflectionHistory] = {}
+    refused: dict[str, Issue] = {}
     fused, filmed = None, None
-    missing = _inputs(flight, loads).missing()
+    loads = flown if isinstance(flown, FlightLoads) else flown.loads if isinstance(flown, Flight) else None
+    missing = Inputs.of(flown if isinstance(flown, FlightLoads) else flown.telemetry).missing()
     for k, method in enumerate(sorted(methods, key=_AS_RUN.index)):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method in missing:
                 raise GateError([missing[method]])
             if method == "camera":
-                assert flight is not None  # whose film it is
+                assert not isinstance(flown, FlightLoads)  # which are never filmed
                 from postflight.filming import camera_answer, keep_oriented
 
                 shown = part_of(report, k / len(methods), (k + 1) / len(methods))
-                filmed = camera_answer(bet or flight, progress=shown) if camera is None else camera.result()
-                keep_oriented(flight.telemetry, filmed.oriented)
+                filmed = camera_answer(flown, progress=shown) if camera is None else camera.result()
+                keep_oriented(flown.telemetry, filmed.oriented)
                 history = filmed.history
-            elif bet is None and loads is None:
-                raise GateError(f"{method}: needs a trajectory, or loads (pf.read_loads)", "input-missing")
-            elif method == "misalignment":
-                history = estimate_misalignment(_loads_of(method, bet or loads))
-            elif method == "trim":
-                history = estimate_trim(_loads_of(method, bet or loads))
-            else:
+            elif method == "fused":
                 from estimators.fusing import fuse_flight
 
                 # the fusion estimates the deflection at the benchmark itself
-                used = filmed is not None and "camera" in answers.histories
+                used = filmed is not None and "camera" in histories
                 own = filmed.plain if filmed is not None and used else None
-                if own is None and flight is not None and "camera" not in answers.refused:
+                if own is None and flight is not None and "camera" not in refused:
                     own = camera_for_fusion(flight)
                 bias_sd_s = 0.0 if flight is None else _time_bias_sd_s(flight)
-                fused = fuse_flight(_loads_of("fuse", bet or loads), own, bias_sd_s, time_bias if used else None)
+                fused = fuse_flight(_loads_of("fuse", flown), own, bias_sd_s, time_bias if used else None)
                 history = fused.history
+            else:
+                history = (estimate_misalignment if method == "misalignment" else estimate_trim)(flown)
         except GateError as fault:
-            answers.refused[method] = Issue(str(fault), fault.codes[0])
+            refused[method] = Issue(str(fault), fault.codes[0])
             continue
-        answered = np.isfinite(history.theta_rad)
         if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
-            answers.refused[method] = Issue(words, "too-few-data")
-        elif answered.any():
-            answers.histories[method] = history
+            refused[method] = Issue(words, "too-few-data")
+        elif np.isfinite(history.theta_rad).any():
+            histories[method] = history
         else:
-            answers.refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
+            refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
-    histories = {m: answers.histories[m] for m in methods if m in answers.histories}
-    refused = {m: answers.refused[m] for m in methods if m in answers.refused}
-    smooth = filmed.smooth if filmed is not None and "camera" in histories else None
-    return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed, smooth_camera=smooth)
-
-
-def _inputs(flight: Flight | None, loads: FlightLoads | None) -> Inputs:
-    """Available inputs of a flight, or of a table of loads."""
-    given = loads if flight is None else flight.telemetry
-    return Inputs() if given is None else Inputs.of(given)
+    histories = {m: histories[m] for m in methods if m in histories}
+    refused = {m: refused[m] for m in methods if m in refused}
+    return Deflections(histories, refused, fused, filmed, None if filmed is None else filmed.smooth, bet, loads)
 
 
 def with_increments(answers: Deflections) -> Deflections:
