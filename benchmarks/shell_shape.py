@@ -33,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import estimator_coverage as dispersed
 from video_coverage import FLOWN_S, flown_scene
 
-from estimators.benchmark import BenchmarkDeflection, benchmark_deflection
+from estimators.benchmark import benchmark_deflection
 from estimators.camera import FilmFit, read_film
 from estimators.cameras import CameraReadings, join_cameras
 from estimators.loads import FlightLoads
@@ -82,7 +82,7 @@ def answers(films: list[FilmFit], pulse: FlightLoads) -> np.ndarray:
         try:
             start = benchmark_deflection(read, pulse, one.oriented.apriori.benchmark_rad)
         except GateError:
-            start = BenchmarkDeflection(np.zeros(2), one.oriented.apriori.benchmark_rad**2 * np.eye(2))
+            start = one.undeflected_benchmark
         read_by.append((read, start))
     if len(films) == 1:
         history = films[0].history(read_by[0][1])

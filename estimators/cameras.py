@@ -96,18 +96,15 @@ class CameraReadings:
         """
         apart_s = self.late_against(clock)
         read, start = self.read, self.benchmark
-        back, covariance = read.per_benchmark, read.own_covariance
-        if start.with_readings is not None:
-            crossed = start.with_readings @ back.transpose(0, 2, 1)
-            value, axes = np.linalg.eigh(np.nan_to_num(covariance + crossed + crossed.transpose(0, 2, 1)))
-            covariance = (axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
-        theta_yz = read.theta_yz_rad + back @ start.theta_yz_rad
+        theta_yz, crossed = read.added_to(start)
+        value, axes = np.linalg.eigh(np.nan_to_num(read.own_covariance + crossed))
+        covariance = (axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
         known = np.isfinite(theta_yz).all(axis=1)
         time_s, theta_yz, covariance = read.time_s[known], theta_yz[known], wider**2 * covariance[known]
         one = evidence_of_readings(
             f"camera {self.name}", time_s, theta_yz, covariance, apart_s, wider * self.plane_sd_rad
         )
-        root = wider * back[known] @ np.linalg.cholesky(start.covariance + 1e-18 * np.eye(2))
+        root = wider * read.per_benchmark[known] @ np.linalg.cholesky(start.covariance + 1e-18 * np.eye(2))
         inputs = {f"{CAMERA_PLANE} {self.name}" if n == CAMERA_PLANE else n: j for n, j in one.by_input.items()}
         if read.by_shape is not None:
             inputs[_SHAPE] = wider * read.by_shape[known]

@@ -243,8 +243,7 @@ def _joined(
     plain = []
     for name, film in films.items():
         read = film.relative_to_benchmark(flight.telemetry.films[name].time_bias_sd_s)
-        nothing = film.oriented.apriori.benchmark_rad**2 * np.eye(2)
-        plain.append(CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD)))
+        plain.append(CameraReadings(name, read, film.undeflected_benchmark, float(CAMERA_PLANE_SD_RAD)))
     corrected = [replace(one, benchmark=benchmarks[one.name] or one.benchmark) for one in plain]
     swing = joint_swing(flight.telemetry.required_vehicle())
     hz = None if swing is None else swing.frequency_hz
