@@ -151,9 +151,7 @@ class Fused:
     def time_bias_summary(self) -> dict[str, Any] | None:
         """Camera time bias for ``summary.json``; None without a camera history that observes it."""
         bias = self.camera_time_bias
-        if bias is None:
-            return None
-        return {"offset_s": bias.offset_s, "sd_s": bias.sd_s, "applied": bias.applied, "words": bias.remark}
+        return None if bias is None else vars(bias) | {"words": bias.remark}
 
     def southwell_summary(self) -> dict[str, Any]:
         """Critical dynamic pressure and offset with their intervals, for ``summary.json``."""
