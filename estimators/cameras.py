@@ -141,11 +141,6 @@ class JoinedCameras:
     readings: tuple[CameraReadings, ...]
 
     @property
-    def clock(self) -> CameraReadings:
-        """Camera in whose time tags the answer is."""
-        return best_clock([one for one in self.readings if one.name != self.left_out])
-
-    @property
     def agree(self) -> bool:
         """Whether no test failed."""
         return all(test.passed for test in self.tests)
@@ -178,7 +173,7 @@ class JoinedCameras:
             moved, in its sd), ``time_bias_s, time_bias_sd_s`` (against the best
             clock), ``chance`` (least of its tests').
         """
-        rows = []
+        rows, clock = [], best_clock([one for one in self.readings if one.name != self.left_out])
         for one in self.readings:
             known = one.read.time_s[one.read.answered]
             bias, late, late_sd = (np.nan, np.nan), 0.0, 0.0
@@ -189,7 +184,7 @@ class JoinedCameras:
             timing = f"{CAMERA_TIME_BIAS} {one.name}"
             if timing in inputs:
                 mean, cov = inputs[timing]
-                late, late_sd = (float(x) * one.late_against(self.clock) for x in (mean[0], np.sqrt(cov[0, 0])))
+                late, late_sd = (float(x) * one.late_against(clock) for x in (mean[0], np.sqrt(cov[0, 0])))
             chance = min((t.p_value for t in self.tests if one.name in t.methods), default=np.nan)
             used = one.name != self.left_out
             span = (float(known[0]), float(known[-1])) if len(known) else (np.nan, np.nan)

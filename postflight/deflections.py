@@ -330,15 +330,10 @@ def fuse(flown: Reconstruction | FlightLoads | Flight, progress: Progress | None
     Deflections
         ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
     """
-    if not _has_loads(flown):
+    if not (isinstance(flown, Flight) and flown.loads is not None):
         check_type("fuse", flown, (Reconstruction, FlightLoads), LOADS)
     has_film = not isinstance(flown, FlightLoads) and flown.telemetry.frames is not None
     return estimate(flown, tuple(m for m in METHODS if m != "camera" or has_film), progress)
-
-
-def _has_loads(flown: object) -> bool:
-    """Whether this is a flight with a table of loads."""
-    return isinstance(flown, Flight) and flown.loads is not None
 
 
 def _loads_of(name: str, flown: Reconstruction | FlightLoads | Flight | None) -> FlightLoads:
@@ -477,10 +472,9 @@ def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> Defl
     untested: Future[CameraTimeBias | None] = Future()
     untested.set_result(None)
     try:
-        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested)
+        found = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested).history
     except GateError:
         return None
-    found = answer.history
     return found if np.isfinite(found.theta_rad).any() else None
 
 

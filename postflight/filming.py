@@ -193,8 +193,8 @@ def camera_answer(
     joined = None
     if several:
         joined, at_plain = _joined(flight, films, benchmarks)
-        unused = films.keys() - {one.name for one in joined.readings}
-        refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in unused}
+        used = {one.name for one in joined.readings}
+        refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in films if name not in used}
         remarks = [f"{name}: {history.assumptions}" for name, history in histories.items()]
         remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
         words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
@@ -245,10 +245,8 @@ def _joined(
         read = film.relative_to_benchmark(flight.telemetry.films[name].time_bias_sd_s)
         plain.append(CameraReadings(name, read, film.undeflected_benchmark, float(CAMERA_PLANE_SD_RAD)))
     corrected = [replace(one, benchmark=benchmarks[one.name] or one.benchmark) for one in plain]
-    swing = joint_swing(flight.telemetry.required_vehicle())
-    hz = None if swing is None else swing.frequency_hz
-    joined = join_cameras(corrected, hz)
-    return joined, join_cameras(plain, hz) if any(benchmarks.values()) else joined
+    joined = join_cameras(corrected, _swing_hz(flight))
+    return joined, join_cameras(plain, _swing_hz(flight)) if any(benchmarks.values()) else joined
 
 
 def _of_all(joined: JoinedCameras, refused: dict[str, Issue]) -> list[Check]:
@@ -329,11 +327,16 @@ def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | N
     """One camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
     if flight.camera_plane_lv_rad is not None:
         return None
-    swing = joint_swing(flight.telemetry.required_vehicle())
     try:
-        return smoothed(history, swing_hz=None if swing is None else swing.frequency_hz)
+        return smoothed(history, swing_hz=_swing_hz(flight))
     except DivergenceError:
         return None
+
+
+def _swing_hz(flight: Flight) -> float | None:
+    """Natural frequency of the vehicle's joint; None without a spring that bends."""
+    swing = joint_swing(flight.telemetry.required_vehicle())
+    return None if swing is None else swing.frequency_hz
 
 
 def is_oriented(telemetry: Telemetry, frames: Frames) -> bool:
