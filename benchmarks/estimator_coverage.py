@@ -209,7 +209,7 @@ def scored(seed, folder, what):
         if found is not None:
             answers[f"fused, {name}"] = found.history
             out.setdefault("disagree", {})[name] = found.agreement.likeliest
-            out["size"] = found.process_size_radps2
+            out["size"] = found.solution.process_size_radps2
     out["rows"] = {name: row_of(h, pulse, truth) for name, h in answers.items()}
     out["rows"]["angle of attack"] = angle_row(pulse, truth)
     return out
@@ -340,7 +340,7 @@ def score_packages(folder):
             f"{n} {np.rad2deg(r[0]):+.3f} +/- {np.rad2deg(r[1]):.3f} ({r[0] / r[1]:+.2f} sd)" for n, r in rows.items()
         )
         said = ", ".join(found.agreement.likeliest) or "agree"
-        size = found.process_size_radps2
+        size = found.solution.process_size_radps2
         print(
             f"{package.name:14} bent {np.rad2deg(rows['trim'][4]):.2f}: {words}; {said}; process {size:.1f} rad/s2",
             flush=True,

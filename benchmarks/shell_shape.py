@@ -33,11 +33,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import estimator_coverage as dispersed
 from video_coverage import FLOWN_S, flown_scene
 
-from estimators.benchmark import BenchmarkDeflection, benchmark_deflection
+from estimators.benchmark import benchmark_deflection
 from estimators.camera import FilmFit, read_film
 from estimators.cameras import CameraReadings, join_cameras
 from estimators.loads import FlightLoads
-from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
+from estimators.shell_shape import ShellShape, shell_shape, with_shape
 from flightmodel.checks import GateError
 from synthetic_flight.film import Imaging, Warp, film
 from tests.estimators.test_camera_deflection import GEOMETRY, JOINT_M, MOUNT, D
@@ -70,7 +70,7 @@ def filmed(seed: int, pulse: FlightLoads, theta_yz: np.ndarray, options: argpars
         own = np.random.default_rng([seed, 17, k])
         frames = list(film(shell, mount, JOINT_M, scene, own, imaging, np.random.default_rng([seed, 19])))
         read = read_film(FLOWN_S, frames, shell, mount, JOINT_M, plane_lv_rad=None)
-        films.append(LoadedFilm(read, pressure))
+        films.append(replace(read, pressure_pa=pressure))
     return films, dispersed.columns(FLOWN_S, pulse.time_s, theta_yz), waves
 
 
@@ -82,7 +82,7 @@ def answers(films: list[FilmFit], pulse: FlightLoads) -> np.ndarray:
         try:
             start = benchmark_deflection(read, pulse, one.oriented.apriori.benchmark_rad)
         except GateError:
-            start = BenchmarkDeflection(np.zeros(2), one.oriented.apriori.benchmark_rad**2 * np.eye(2))
+            start = one.undeflected_benchmark
         read_by.append((read, start))
     if len(films) == 1:
         history = films[0].history(read_by[0][1])
@@ -106,7 +106,7 @@ def one_flight(seed: int, options: argparse.Namespace) -> tuple[ShellShape, int,
         size = np.linalg.norm(true, axis=1)
         inside = films[0].pressure_pa > PULSE_SHARE * films[0].pressure_pa.max()
         rows = []
-        for some in ([one.film for one in films], with_shape(films, shape)):
+        for some in (films, with_shape(films, shape)):
             theta, sd = answers(some, pulse)
             rows.append(np.rad2deg(np.array([theta - size, sd])[:, inside]))
     except GateError as fault:

@@ -34,7 +34,7 @@ def separation(seed, folder):
     pulse = replace(pulse, vehicle=replace(flown_aero(pulse.vehicle, truth, known), uncertainty=known))
     use, rng = pulse.through_pulse, np.random.default_rng([seed, 3, 2009])
     camera = camera_history(rng, truth["theta_yz"][use], pulse.time_s[use], CAMERA_SD["clean"])
-    input_posterior = fuse_flight(pulse, camera).input_posterior
+    input_posterior = fuse_flight(pulse, camera).solution.input_posterior
     faults = fault_hypotheses(pulse, input_posterior, CAMERA_PLANE_SD_RAD)
     columns = np.hstack([faults[suspect] for suspect in SIDES])
     return columns.T @ (columns - input_posterior.covariance @ columns)

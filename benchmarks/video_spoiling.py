@@ -164,7 +164,7 @@ def read_as_a_user(footage: Footage) -> tuple[int, int, float, float, bool]:
         laid_out(footage, Path(root))
         flight = read_flight(root, needs_path=False)
         film = camera_film(flight)
-        is_red = not all(check.passed for check in camera_answer(flight, None, film=film).consistency_checks)
+        is_red = not all(check.passed for check in camera_answer(flight, film).consistency_checks)
     off_benchmark = np.abs(footage.time_s - footage.benchmark_s) > 1e-3
     answered, beyond, worst = 0, 0, (0.0, 0.0)
     for fit, yz, other in zip(film.fits, footage.theta_yz_rad, off_benchmark, strict=True):

@@ -217,7 +217,7 @@ def time_two_cameras(folder: Path) -> None:
 
     def answer(*names: str) -> object:
         films = {name: replace(frames) for name in names}  # anew, as what a film remembers of its pictures takes time
-        return camera_answer(Flight(replace(flight.telemetry, films=films)), None)
+        return camera_answer(Flight(replace(flight.telemetry, films=films)))
 
     jobs = {"one camera": lambda: answer(name), "two cameras": lambda: answer(name, "second")}
     print_ratios(rounds(jobs, 5), "one camera")

@@ -568,6 +568,14 @@ class RelativeDeflections:
             return self.covariance
         return self.covariance - self.by_shape @ self.by_shape.transpose(0, 2, 1)
 
+    def added_to(self, start: BenchmarkDeflection) -> tuple[FloatArray, FloatArray]:
+        """Deflections (n, 2) from a benchmark frame's own, and twice the covariance (n, 2, 2) of both their errors."""
+        theta_yz = self.theta_yz_rad + self.per_benchmark @ start.theta_yz_rad
+        if start.with_readings is None:
+            return theta_yz, np.zeros_like(self.covariance)
+        crossed = start.with_readings @ self.per_benchmark.transpose(0, 2, 1)
+        return theta_yz, crossed + crossed.transpose(0, 2, 1)
+
     @property
     def answered(self) -> BoolArray:
         """Whether each frame has an answer, (n,)."""

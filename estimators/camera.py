@@ -93,6 +93,8 @@ class FilmFit:
         Assumed plane; None: estimated in every frame.
     plane_sd_rad : float
         Of the assumed plane.
+    pressure_pa : (n,) float
+        Dynamic pressure at the frames; NaN where no trajectory gives it.
     edited : str
         What an analyst edited, and what was left out of every picture.
     shape_covariance : (13 (1 + c), 13 (1 + c)) float or None
@@ -105,6 +107,7 @@ class FilmFit:
     benchmark_s: float
     plane_lv_rad: float | None
     plane_sd_rad: float
+    pressure_pa: FloatArray
     edited: str = ""
     shape_covariance: FloatArray | None = None
 
@@ -146,30 +149,30 @@ class FilmFit:
         ``method = "camera"``. NaN where a frame was refused, with the reasons in ``assumptions``. In an assumed plane
         the angle has a sign.
         """
-        if benchmark is not None:
-            read = self.relative_to_benchmark()
-            back = read.per_benchmark
-            covariance = read.covariance + back @ benchmark.covariance @ back.transpose(0, 2, 1)
-            if benchmark.with_readings is not None:
-                crossed = benchmark.with_readings @ back.transpose(0, 2, 1)
-                covariance = covariance + crossed + crossed.transpose(0, 2, 1)
-            theta_yz = read.theta_yz_rad + back @ benchmark.theta_yz_rad
-            return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._remark(benchmark))
-        n = len(self.time_s)
-        theta, plane, covariance = np.full(n, np.nan), np.full(n, np.nan), np.full((n, 2, 2), np.nan)
+        if self.plane_lv_rad is not None:
+            return self._history_in_plane(self.plane_lv_rad)
+        read = self.relative_to_benchmark()
+        start, back = benchmark or self.undeflected_benchmark, read.per_benchmark
+        theta_yz, crossed = read.added_to(start)
+        covariance = read.covariance + back @ start.covariance @ back.transpose(0, 2, 1) + crossed
+        return history_from_lateral(self.time_s, theta_yz, covariance, "camera", self._remark(benchmark))
+
+    @property
+    def undeflected_benchmark(self) -> BenchmarkDeflection:
+        """No deflection in the benchmark frame, within its a priori sd."""
+        return BenchmarkDeflection(np.zeros(2), self.oriented.apriori.benchmark_rad**2 * np.eye(2))
+
+    def _history_in_plane(self, plane_lv_rad: float) -> DeflectionHistory:
+        """History of the deflection in an assumed plane, with the error of that plane."""
+        n, sd2 = len(self.time_s), self.plane_sd_rad**2
+        theta, covariance = np.full(n, np.nan), np.full((n, 2, 2), np.nan)
         for k, fit in enumerate(self.fits):
-            if fit.refused:
-                continue
-            if self.plane_lv_rad is None:
-                theta[k], plane[k], covariance[k] = polar(fit.rotation_yz_rad, fit.covariance)
-            else:
-                theta[k] = fit.rotation_yz_rad @ _axis_of(self.plane_lv_rad)
-                s, sd2 = fit.plane_leak, self.plane_sd_rad**2
+            if not fit.refused:
+                theta[k], s = fit.rotation_yz_rad @ _axis_of(plane_lv_rad), fit.plane_leak
                 off = theta[k] ** 2 * (s**2 * sd2 + 3.0 * (0.5 + s**2) ** 2 * sd2**2)
                 cross = -theta[k] * s * sd2
                 covariance[k] = [[fit.covariance[0, 0] + off, cross], [cross, sd2]]
-        if self.plane_lv_rad is not None:
-            plane[:] = self.plane_lv_rad
+        plane = np.full(n, plane_lv_rad)
         return DeflectionHistory(self.time_s, theta, plane, covariance, "camera", self._remark(None))
 
     def frame_table(self, history: DeflectionHistory) -> pd.DataFrame:
@@ -336,7 +339,10 @@ def read_film(
     remarks = [f"by hand: {edits}"] if edits.rows else []
     if fixed is not None:
         remarks.append(f"text burnt into the film, or dead lines: {100.0 * fixed.mean():.0f} % of the picture left out")
-    return FilmFit(times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, "; ".join(remarks))
+    unknown_pa = np.full(len(times), np.nan)
+    return FilmFit(
+        times, tuple(fits), oriented, benchmark_s, plane_lv_rad, plane_sd_rad, unknown_pa, "; ".join(remarks)
+    )
 
 
 def has_texture(oriented: OrientedCamera) -> bool:
@@ -378,9 +384,13 @@ def without_lost_features(fits: list[FrameFit]) -> list[FrameFit]:
 def _without_bare(fits: list[FrameFit]) -> list[FrameFit]:
     """Refuse edge-only frames, except those whose edge contradicts features that were found."""
     words = "no feature agrees, though some do in other frames: the edge alone may not be the shell's"
-    lost = Issue(words, "features-lost")
     bare = [not fit.refused and fit.features == 0 and not fit.contradicted for fit in fits]
-    return [refused_fit(fit.horizon, lost) if alone else fit for fit, alone in zip(fits, bare, strict=True)]
+    return _refused(fits, bare, Issue(words, "features-lost"))
+
+
+def _refused(fits: list[FrameFit], out: Iterable[bool], fault: Issue) -> list[FrameFit]:
+    """Fits of which some are refused."""
+    return [refused_fit(fit.horizon, fault) if bad else fit for fit, bad in zip(fits, out, strict=True)]
 
 
 def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s: float) -> list[FrameFit]:
@@ -397,8 +407,7 @@ def without_stray_texture(time_s: FloatArray, fits: list[FrameFit], benchmark_s:
     if with_texture.sum() >= _LEAST_PAINTED and np.mean(agreed[with_texture]) > _PAINTED * agreed.max():
         return _without_bare(fits)
     words = "texture agrees, though in most frames none does: it may be shading, which moves with the Sun"
-    fault = Issue(words, "texture-strays")
-    return [refused_fit(fit.horizon, fault) if out else fit for fit, out in zip(fits, with_texture, strict=True)]
+    return _refused(fits, with_texture, Issue(words, "texture-strays"))
 
 
 def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
@@ -408,7 +417,7 @@ def without_remnants(fits: list[FrameFit]) -> list[FrameFit]:
     if len(shown) < _LEVEL_FRAMES or refused <= _MOST:
         return fits
     words = f"{100.0 * refused:.0f} % of the film's frames show no shell that can be read: an answer here may be chance"
-    return [fit if fit.refused else refused_fit(fit.horizon, Issue(words, "film-mostly-refused")) for fit in fits]
+    return _refused(fits, [not fit.refused for fit in fits], Issue(words, "film-mostly-refused"))
 
 
 def without_moved(fits: list[FrameFit]) -> list[FrameFit]:
@@ -443,12 +452,9 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     """
     contradicts = np.array([fit.contradicted or getattr(fit.refused, "code", "") in _NOT_THE_SHELL for fit in fits])
     words = "two or more of the four frames around contradict the shell: an answer here may be chance"
-    out = []
-    for k, fit in enumerate(fits):
-        around = np.delete(contradicts[max(k - 2, 0) : k + 3], min(k, 2))
-        doubtful = not fit.refused and int(around.sum()) >= _DOUBTFUL
-        out.append(refused_fit(fit.horizon, Issue(words, "frames-around-refused")) if doubtful else fit)
-    return out
+    around = np.convolve(contradicts, [1, 1, 0, 1, 1])[2:-2]
+    doubtful = [not fit.refused and count >= _DOUBTFUL for fit, count in zip(fits, around, strict=True)]
+    return _refused(fits, doubtful, Issue(words, "frames-around-refused"))
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ import pandas as pd
 
 from estimators.agreement import Pair, agreement
 from estimators.benchmark import BenchmarkDeflection, RelativeDeflections
+from estimators.deflection_spline import Inputs, Solution
 from estimators.evidence import (
     CAMERA_PLANE,
     CAMERA_TIME_BIAS,
@@ -44,8 +45,8 @@ from estimators.evidence import (
     evidence_of_readings,
     moved_evidence,
 )
-from estimators.fusion import LEAST_SAMPLES, Fused, Inputs, equations_of, fuse, span_of, with_unresolved_swing
-from flightmodel.checks import DivergenceError, FloatArray
+from estimators.fusion import LEAST_SAMPLES, equations_of, fuse, span_of, with_unresolved_swing
+from flightmodel.checks import DivergenceError
 from flightmodel.deflection import DeflectionHistory, history_from_lateral
 from flightmodel.trajectory import nearest_index
 
@@ -95,18 +96,15 @@ class CameraReadings:
         """
         apart_s = self.late_against(clock)
         read, start = self.read, self.benchmark
-        back, covariance = read.per_benchmark, read.own_covariance
-        if start.with_readings is not None:
-            crossed = start.with_readings @ back.transpose(0, 2, 1)
-            value, axes = np.linalg.eigh(np.nan_to_num(covariance + crossed + crossed.transpose(0, 2, 1)))
-            covariance = (axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
-        theta_yz = read.theta_yz_rad + back @ start.theta_yz_rad
+        theta_yz, crossed = read.added_to(start)
+        value, axes = np.linalg.eigh(np.nan_to_num(read.own_covariance + crossed))
+        covariance = (axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
         known = np.isfinite(theta_yz).all(axis=1)
         time_s, theta_yz, covariance = read.time_s[known], theta_yz[known], wider**2 * covariance[known]
         one = evidence_of_readings(
             f"camera {self.name}", time_s, theta_yz, covariance, apart_s, wider * self.plane_sd_rad
         )
-        root = wider * back[known] @ np.linalg.cholesky(start.covariance + 1e-18 * np.eye(2))
+        root = wider * read.per_benchmark[known] @ np.linalg.cholesky(start.covariance + 1e-18 * np.eye(2))
         inputs = {f"{CAMERA_PLANE} {self.name}" if n == CAMERA_PLANE else n: j for n, j in one.by_input.items()}
         if read.by_shape is not None:
             inputs[_SHAPE] = wider * read.by_shape[known]
@@ -129,7 +127,7 @@ class JoinedCameras:
         Camera that contradicts the others, which agree without it.
     wider : float
         Factor on the cameras' sd where who contradicts cannot be determined.
-    fused : Fused
+    solution : Solution
     readings : tuple of CameraReadings
         Those that were used or left out.
     """
@@ -139,13 +137,8 @@ class JoinedCameras:
     tests: tuple[Pair, ...]
     left_out: str | None
     wider: float
-    fused: Fused
+    solution: Solution
     readings: tuple[CameraReadings, ...]
-
-    @property
-    def clock(self) -> CameraReadings:
-        """Camera in whose time tags the answer is."""
-        return best_clock([one for one in self.readings if one.name != self.left_out])
 
     @property
     def agree(self) -> bool:
@@ -180,18 +173,18 @@ class JoinedCameras:
             moved, in its sd), ``time_bias_s, time_bias_sd_s`` (against the best
             clock), ``chance`` (least of its tests').
         """
-        rows = []
+        rows, clock = [], best_clock([one for one in self.readings if one.name != self.left_out])
         for one in self.readings:
             known = one.read.time_s[one.read.answered]
             bias, late, late_sd = (np.nan, np.nan), 0.0, 0.0
-            inputs, own = self.fused.inputs, f"camera {one.name}"
+            inputs, own = self.solution.inputs, f"camera {one.name}"
             if own in inputs:
                 mean = inputs[own][0]
                 bias = mean[0], mean[len(mean) // 2]
             timing = f"{CAMERA_TIME_BIAS} {one.name}"
             if timing in inputs:
                 mean, cov = inputs[timing]
-                late, late_sd = (float(x) * one.late_against(self.clock) for x in (mean[0], np.sqrt(cov[0, 0])))
+                late, late_sd = (float(x) * one.late_against(clock) for x in (mean[0], np.sqrt(cov[0, 0])))
             chance = min((t.p_value for t in self.tests if one.name in t.methods), default=np.nan)
             used = one.name != self.left_out
             span = (float(known[0]), float(known[-1])) if len(known) else (np.nan, np.nan)
@@ -216,7 +209,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
         Where there are too few readings, or their time biases do not settle.
     """
     enough = _with_loaded_benchmarks([one for one in cameras if one.frames >= LEAST_SAMPLES])
-    fused, tests = _joined(enough, 1.0)
+    history, solution, tests = _joined(enough, 1.0)
     left_out, wider, used = None, 1.0, enough
     if not all(test.passed for test in tests):
         left_out = _left_out(enough)
@@ -224,8 +217,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
             used = [one for one in enough if one.name != left_out]
         else:
             wider = float(np.sqrt(max(test.chi_square / test.degrees for test in tests)))
-        fused, _ = _joined(used, wider)
-    history = fused.history
+        history, solution, _ = _joined(used, wider)
     frames = np.unique(np.concatenate([one.read.time_s[one.read.answered] for one in used]))
     at = np.isin(history.time_s, frames)
     words = f"from {len(used)} cameras with systematic errors of their own: {', '.join(one.name for one in used)}"
@@ -237,7 +229,7 @@ def join_cameras(cameras: list[CameraReadings], swing_hz: float | None = None) -
     )
     if swing_hz is not None:
         smooth = with_unresolved_swing(at_frames, smooth, swing_hz)
-    return JoinedCameras(at_frames, smooth, tuple(tests), left_out, wider, fused, tuple(enough))
+    return JoinedCameras(at_frames, smooth, tuple(tests), left_out, wider, solution, tuple(enough))
 
 
 def _with_loaded_benchmarks(cameras: list[CameraReadings]) -> list[CameraReadings]:
@@ -268,8 +260,8 @@ def best_clock(cameras: list[CameraReadings]) -> CameraReadings:
     return min(cameras, key=lambda one: one.read.time_bias_sd_s)
 
 
-def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[Pair]]:
-    """Posterior of some cameras, and the tests of their agreement."""
+def _joined(cameras: list[CameraReadings], wider: float) -> tuple[DeflectionHistory, Solution, list[Pair]]:
+    """Deflection and posterior of some cameras, and the tests of their agreement."""
     if not cameras:
         raise DivergenceError("camera: no camera has enough frames with an answer", code="too-few-data")
     evidence = [one.evidence(best_clock(cameras), wider) for one in cameras]
@@ -278,50 +270,46 @@ def _joined(cameras: list[CameraReadings], wider: float) -> tuple[Fused, list[Pa
     at_s = np.unique(np.concatenate([known, grid]))
     # a grid time within rounding of a frame's would be a row of its own
     at_s = at_s[np.isin(at_s, known) | (np.abs(at_s - known[nearest_index(known, at_s)]) > 1e-6)]
-    fused = _fitted(evidence, at_s)
-    tests = (
-        [*_pair_tests(evidence, fused), *_offset_tests(evidence, fused)] if len(cameras) > 1 and wider == 1.0 else []
-    )
-    return fused, tests
-
-
-def _fitted(evidence: list[Evidence], at_s: FloatArray) -> Fused:
-    """Posterior of the deflection and of the cameras' errors."""
 
     def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
         return [moved_evidence(one, inputs, about) for one in evidence]
 
     # 1.5 usual steps of the slowest camera from a frame the process still answers, 0.5 s at least
     near_s = max(0.5, *(1.5 * float(np.median(np.diff(one.time_s))) for one in evidence))
-    return fuse(read, "camera", at_s, near_s=near_s, free_process=False)
+    history, solution = fuse(read, "camera", at_s, near_s=near_s, free_process=False)
+    tests: list[Pair] = []
+    if len(cameras) > 1 and wider == 1.0:
+        timed = _timed(evidence, solution)
+        tests = [*_pair_tests(timed, solution), *_offset_tests(timed)]
+    return history, solution, tests
 
 
-def _timed(evidence: list[Evidence], fused: Fused) -> list[Evidence]:
+def _timed(evidence: list[Evidence], solution: Solution) -> list[Evidence]:
     """Readings moved by the fitted time biases; the remaining time-bias errors are inputs like any other."""
-    known = {name: value for name, value in fused.inputs.items() if name.startswith(CAMERA_TIME_BIAS)}
+    known = {name: value for name, value in solution.inputs.items() if name.startswith(CAMERA_TIME_BIAS)}
     out = []
     for one in evidence:
-        moved = moved_evidence(one, {name: mean for name, (mean, _) in known.items()}, fused.deflection)
+        moved = moved_evidence(one, {name: mean for name, (mean, _) in known.items()}, solution.deflection)
         own = {name: cov[0, 0] for name, (_, cov) in known.items() if name in moved.by_input}
         left = {name: np.sqrt(var) * moved.by_input[name] for name, var in own.items()}
         out.append(replace(moved, by_input=moved.by_input | left, time_bias_sd_s=0.0, time_bias=""))
     return out
 
 
-def _pair_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
+def _pair_tests(timed: list[Evidence], solution: Solution) -> list[Pair]:
     """Differences of every two cameras in overlapping spans, corrected for the motion between their frames."""
-    still = [replace(e, theta_yz_rad=e.theta_yz_rad - fused.deflection(e.time_s)) for e in _timed(evidence, fused)]
+    still = [replace(e, theta_yz_rad=e.theta_yz_rad - solution.deflection(e.time_s)) for e in timed]
     pairs = agreement(still).pairs
     return [replace(pair, methods=tuple(m.removeprefix("camera ") for m in pair.methods)) for pair in pairs]
 
 
-def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
+def _offset_tests(timed: list[Evidence]) -> list[Pair]:
     """Offset of each camera, left free, from the others, over its sd from all errors.
 
     The process's size is then the motion's own: taken as motion, an offset at a switch would make it large enough to
     explain the step.
     """
-    out, free, timed = [], [], _timed(evidence, fused)
+    out, free = [], []
     for k, one in enumerate(timed):
         anything = np.zeros((len(one.time_s), 2, 2 * len(timed)))
         anything[:, :, 2 * k : 2 * k + 2] = _ANY_OFFSET_RAD * np.eye(2)
@@ -331,8 +319,8 @@ def _offset_tests(evidence: list[Evidence], fused: Fused) -> list[Pair]:
     others = np.setdiff1d(np.arange(len(whole.matrix.corner)), offsets)
     for k, one in enumerate(timed):
         alone = whole.with_inputs(np.concatenate([others, offsets[2 * k : 2 * k + 2]]))
-        answer = alone.solved(alone.process_size(), "camera")
-        mean, covariance = answer.of_inputs[-2:], answer.inputs[-2:, -2:]
+        found = alone.solved(alone.process_size(), "camera").input_posterior
+        mean, covariance = found.mean[-2:], found.covariance[-2:, -2:]
         if np.trace(covariance) < 2.0 - _LEAST_INFORMATION:  # else nothing connects it with the others
             square = float(mean @ np.linalg.solve(covariance, mean))
             out.append(Pair((one.method.removeprefix("camera "),), square, 2))
@@ -346,7 +334,7 @@ def _left_out(cameras: list[CameraReadings]) -> str | None:
     sound = []
     for one in cameras:
         try:
-            _, tests = _joined([other for other in cameras if other is not one], 1.0)
+            _, _, tests = _joined([other for other in cameras if other is not one], 1.0)
         except DivergenceError:
             continue
         if all(test.passed for test in tests):

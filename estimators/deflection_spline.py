@@ -123,32 +123,36 @@ class SplineDeflection:
 
 @dataclass(frozen=True)
 class Solution:
-    """Posterior of the deflection's coefficients and the inputs' unit normals.
+    """Posterior of the deflection and of the inputs on which the methods depend.
 
     Parameters
     ----------
     spline : Spline
-    mean : (2 m + k,) float
+    mean : (2 m,) float
+        The spline's coefficients, y and z of each side by side.
     factor : ArrowFactor
         Of the normal equations.
-    inputs : (k, k) float
-        Covariance of the inputs.
+    input_posterior : InputPosterior
+    process_size_radps2 : float
+        Of the joint's acceleration at each knot.
     """
 
     spline: Spline
     mean: FloatArray
     factor: ArrowFactor
-    inputs: FloatArray
+    input_posterior: InputPosterior
+    process_size_radps2: float
 
     @property
     def deflection(self) -> Deflection:
         """Mean lateral vectors (n, 2), from times."""
-        return SplineDeflection(self.spline, self.mean[: 2 * self.spline.count].reshape(-1, 2))
+        return SplineDeflection(self.spline, self.mean.reshape(-1, 2))
 
     @property
-    def of_inputs(self) -> FloatArray:
-        """Mean (k,) of the inputs."""
-        return self.mean[2 * self.spline.count :]
+    def inputs(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Mean (k,) and covariance (k, k) of each input's unit normals."""
+        post = self.input_posterior
+        return {name: (post.mean[at], post.covariance[at, at]) for name, at in post.place.items()}
 
     @cached_property
     def own(self) -> csr_array:
@@ -162,26 +166,33 @@ class Solution:
 
     @cached_property
     def sd(self) -> FloatArray:
-        """Standard deviations (2 m + k,)."""
-        moved = np.sum((self.by_input @ self.inputs) * self.by_input, axis=1)
-        return np.sqrt(np.concatenate([self.own.diagonal() + moved, np.diag(self.inputs)]))
+        """Standard deviations (2 m,) of the coefficients."""
+        moved = np.sum((self.by_input @ self.input_posterior.covariance) * self.by_input, axis=1)
+        return np.sqrt(self.own.diagonal() + moved)
 
-    def lateral_cov(self, value: csr_array) -> FloatArray:
-        """Covariance (n, 2, 2) of the lateral vectors at rows (n, m) of the spline."""
+    def lateral_cov(self, time_s: FloatArray) -> FloatArray:
+        """Covariance (n, 2, 2) of the lateral vectors at times (n,)."""
+        value, of_inputs = self.spline.rows(time_s), self.input_posterior.covariance
         moved = np.stack([value @ self.by_input[axis::2] for axis in range(2)], axis=1)
         # one product for all times: many of two rows each take much longer
-        spread = (moved.reshape(2 * len(moved), len(self.inputs)) @ self.inputs).reshape(moved.shape)
+        spread = (moved.reshape(2 * len(moved), len(of_inputs)) @ of_inputs).reshape(moved.shape)
         cov = spread @ moved.transpose(0, 2, 1)
         for i in range(2):
             for j in range(2):
                 cov[:, i, j] += (value @ self.own[i::2, j::2]).multiply(value).sum(axis=1)
         return np.asarray(cov)
 
-    def covariance_of(self, pick: FloatArray) -> FloatArray:
-        """Covariance (g, g) of combinations (g, 2 m + k) of inputs and of the deflection at one time."""
-        of_deflection, of_inputs = np.hsplit(pick, [self.own.shape[0]])
-        moved = of_deflection @ self.by_input + of_inputs
-        return np.asarray(of_deflection @ (self.own @ of_deflection.T) + moved @ self.inputs @ moved.T)
+    def correlation_at(self, time_s: float) -> FloatArray:
+        """Correlation of the deflection's two components at a time and of each input's leading unit normal."""
+        post = self.input_posterior
+        of_deflection = np.zeros((2 + len(post.place), len(self.mean)))
+        of_deflection[0, 0::2] = of_deflection[1, 1::2] = self.spline.rows(np.array([time_s])).toarray()[0]
+        moved = of_deflection @ self.by_input
+        for k, at in enumerate(post.place.values()):
+            moved[2 + k, at.start] = 1.0
+        covariance = of_deflection @ (self.own @ of_deflection.T) + moved @ post.covariance @ moved.T
+        sd = np.sqrt(np.diag(covariance))
+        return np.asarray(covariance / np.outer(sd, sd))
 
 
 @dataclass(frozen=True)
@@ -246,15 +257,17 @@ class NormalEquations:
         except np.linalg.LinAlgError:
             message = f"{method}: the readings do not determine the deflection"
             raise DivergenceError(message, code="not-observable") from None
-        return Solution(self.spline, factor.solve(self.right), factor, factor.border_covariance)
+        mean, inputs = np.split(factor.solve(self.right), [2 * self.spline.count])
+        input_posterior = InputPosterior(inputs, factor.border_covariance, self.place)
+        return Solution(self.spline, mean, factor, input_posterior, size_radps2)
 
-    def smoothed(self, inputs: InputPosterior, method: str) -> tuple[Solution, float]:
-        """Posterior of all unknowns, of inputs found without the process, and the process's size."""
+    def smoothed(self, inputs: InputPosterior, method: str) -> Solution:
+        """Posterior of all unknowns, of inputs found without the process, which has its most probable size."""
         alone, size = self.with_inputs(np.arange(0)), 2 * self.spline.count
         given = replace(alone, right=self.right[:size] - self.matrix.across @ inputs.mean)
         size_radps2 = given.process_size()
-        mean = np.concatenate([given.solved(size_radps2, method).mean, inputs.mean])
-        return replace(self.solved(size_radps2, method), mean=mean, inputs=inputs.covariance), size_radps2
+        mean = given.solved(size_radps2, method).mean
+        return replace(self.solved(size_radps2, method), mean=mean, input_posterior=inputs)
 
     def process_size(self) -> float:
         """Most probable size of the process, rad/s^2, deflection and inputs integrated over."""

@@ -6,8 +6,8 @@ fused history against dynamic pressure gives the Southwell lines (`estimators.so
 estimated with the rest where the deflection moves enough to observe it.
 
 Where the methods contradict each other, each is tried as the faulty one by leaving it out. If the others agree without
-one and only without that one, it stays out (`FusedAnswer.left_out`). If the readings cannot tell, the answer is the
-mixture of what may be true, with the differences in its covariance (`FusedAnswer.alternatives`): the others without
+one and only without that one, it stays out (`Fused.left_out`). If the readings cannot tell, the answer is the
+mixture of what may be true, with the differences in its covariance (`Fused.alternatives`): the others without
 each method, or a posterior in which the likeliest fault's inputs are as good as unknown.
 """
 
@@ -15,19 +15,19 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from estimators.agreement import CONFIDENCE, HYPOTHESES, Agreement, agreement, fault_hypotheses
-from estimators.evidence import CAMERA_TIME_BIAS, evidence_of_history, moved_evidence
+from estimators.deflection_spline import Inputs, Solution
+from estimators.evidence import CAMERA_TIME_BIAS, Deflection, Evidence, evidence_of_history, moved_evidence
 from estimators.fusion import (
     FarInputsError,
-    Fused,
     LoadsReader,
     Method,
-    Read,
     fuse,
     knots_of,
     loads_reader,
@@ -76,15 +76,19 @@ class CameraTimeBias:
 
 
 @dataclass(frozen=True)
-class FusedAnswer(Fused):
+class Fused:
     """Posterior of deflection and inputs, tests of the methods against each other, and the Southwell lines.
-
-    The posterior is that of the methods that are used; its history holds the mixture where there are alternatives.
 
     Parameters
     ----------
+    history : DeflectionHistory
+        At the times of the method with most samples; the mixture where there are alternatives.
+    solution : Solution
+        Posterior of the methods that are used.
     agreement : Agreement
         Of all methods.
+    reader : LoadsReader
+        Of the loads, and of the camera where it is not left out, whatever was made of their disagreement.
     limbs : Limbs or None
         None where the pulse gives no line; ``limbs_remark`` says why, or what the lines show.
     camera_time_bias : CameraTimeBias or None
@@ -92,17 +96,23 @@ class FusedAnswer(Fused):
         Method that contradicts the others, which agree without it.
     alternatives : tuple of str
         What the answer is a mixture of, in words; empty where the readings agree.
-    reader : LoadsReader or None
-        Of what the loads say, and the camera where it is not left out, whatever was made of their disagreement.
     """
 
+    history: DeflectionHistory
+    solution: Solution
     agreement: Agreement
-    limbs: Limbs | None
-    limbs_remark: str
+    reader: LoadsReader
+    limbs: Limbs | None = None
+    limbs_remark: str = ""
     camera_time_bias: CameraTimeBias | None = None
     left_out: str | None = None
     alternatives: tuple[str, ...] = ()
-    reader: LoadsReader | None = None
+
+    @cached_property
+    def best_s(self) -> float:
+        """Time of the smallest deflection sd, s."""
+        time_s = self.history.time_s
+        return float(time_s[np.argmin(np.trace(self.solution.lateral_cov(time_s), axis1=1, axis2=2))])
 
     @property
     def remark(self) -> str:
@@ -141,9 +151,7 @@ class FusedAnswer(Fused):
     def time_bias_summary(self) -> dict[str, Any] | None:
         """Camera time bias for ``summary.json``; None without a camera history that observes it."""
         bias = self.camera_time_bias
-        if bias is None:
-            return None
-        return {"offset_s": bias.offset_s, "sd_s": bias.sd_s, "applied": bias.applied, "words": bias.remark}
+        return None if bias is None else vars(bias) | {"words": bias.remark}
 
     def southwell_summary(self) -> dict[str, Any]:
         """Critical dynamic pressure and offset with their intervals, for ``summary.json``."""
@@ -163,9 +171,9 @@ class FusedAnswer(Fused):
 
         Columns ``input, moved_sd, sd_left, correlation_with_deflection_y, correlation_with_deflection_z``.
         """
-        rows = []
-        for k, (name, (mean, cov)) in enumerate(self.inputs.items()):
-            rows.append((name, mean[0], np.sqrt(cov[0, 0]), *self.correlation[2 + k, :2]))
+        rows, correlation = [], self.solution.correlation_at(self.best_s)
+        for k, (name, (mean, cov)) in enumerate(self.solution.inputs.items()):
+            rows.append((name, mean[0], np.sqrt(cov[0, 0]), *correlation[2 + k, :2]))
         names = ["input", "moved_sd", "sd_left", "correlation_with_deflection_y", "correlation_with_deflection_z"]
         return pd.DataFrame(rows, columns=names)
 
@@ -180,7 +188,7 @@ def fuse_flight(
     camera: DeflectionHistory | None,
     camera_time_bias_sd_s: float = 0.0,
     time_bias: Result[CameraTimeBias | None] | None = None,
-) -> FusedAnswer:
+) -> Fused:
     """Fuse accelerometers, moment balance and, where there is one, the camera's history.
 
     A camera time bias with the a priori sd ``camera_time_bias_sd_s`` is estimated with the rest. One that is stated as
@@ -213,10 +221,9 @@ def fuse_flight(
     sources = _Sources(loads, camera)
     observable = camera is not None and sources.shows_time_bias()
     bias_sd_s = camera_time_bias_sd_s if observable else 0.0
-    is_tested = observable and bias_sd_s == 0.0
 
     def bias() -> CameraTimeBias | None:
-        if not is_tested:
+        if not observable or bias_sd_s > 0.0:
             return None
         return _tested_time_bias(sources) if time_bias is None else time_bias.result()
 
@@ -233,8 +240,11 @@ def fuse_flight(
         elif answer.agreement.hypotheses:
             answer = _with_faults_freed(sources, answer, bias_sd_s)
     seen = tuple(n for n in sources.names if n != "camera" or answer.left_out != "camera")
-    answer = replace(answer, reader=sources.loads_reader(seen, bias_sd_s))
-    return answer if answer.camera_time_bias is not None else replace(answer, camera_time_bias=bias())
+    limbs, remark = _limbs(answer.history, loads)
+    return replace(
+        answer, reader=sources.reader(seen, bias_sd_s), limbs=limbs, limbs_remark=remark,
+        camera_time_bias=answer.camera_time_bias or bias(),
+    )  # fmt: skip
 
 
 def time_bias_if_free(loads: FlightLoads, camera: DeflectionHistory) -> CameraTimeBias | None:
@@ -256,50 +266,44 @@ class _Sources:
         seen = self.camera is not None and np.isfinite(self.camera.theta_rad).any()
         return (*_METHODS, "camera") if seen else tuple(_METHODS)
 
-    def reader(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> Read:
-        """Reader of some methods; inputs in ``freed`` are as good as unknown."""
-        read = self.loads_reader(names, bias_sd_s)
+    @cached_property
+    def by_loads(self) -> LoadsReader:
+        """Reader of all methods that read the loads."""
+        return loads_reader(self.loads, _METHODS, [])
 
-        def scaled(values: dict[str, FloatArray]) -> dict[str, FloatArray]:
-            return {name: _FREED * x if name in freed else x for name, x in values.items()}
-
-        return lambda inputs, about: [
-            replace(one, by_input=scaled(one.by_input)) for one in read(scaled(inputs), about)
-        ]
-
-    def loads_reader(self, names: tuple[str, ...], bias_sd_s: float) -> LoadsReader:
+    def reader(self, names: tuple[str, ...], bias_sd_s: float) -> LoadsReader:
         """Reader of some methods."""
         others = []
         if "camera" in names and self.camera is not None:
             others = [evidence_of_history(self.camera, bias_sd_s, CAMERA_PLANE_SD_RAD)]
-        return loads_reader(self.loads, {n: m for n, m in _METHODS.items() if n in names}, others)
+        return replace(self.by_loads, methods={n: m for n, m in _METHODS.items() if n in names}, others=others)
 
     def shows_time_bias(self) -> bool:
         """Whether the deflection moves enough for the camera's time bias to be observed."""
-        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S[0]), self.knot_s)
+        return time_bias_is_observable(self.reader(self.names, _WIDE_BIAS_SD_S[0]), knots_of(self.loads))
 
-    @property
-    def knot_s(self) -> float:
-        """Spacing of the fusion's knots."""
-        return knots_of(self.loads)
+    def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> Fused:
+        """Common posterior of some methods and the test of their agreement; `DivergenceError` without one.
 
-    def fused(self, read: Read) -> Fused:
-        """Posterior of what a reader gives; `DivergenceError` without one."""
-        return fuse(read, knot_s=self.knot_s)
+        Inputs in ``freed`` are as good as unknown.
+        """
+        reader = self.reader(names, bias_sd_s)
 
-    def answer(self, names: tuple[str, ...], bias_sd_s: float, freed: tuple[str, ...] = ()) -> FusedAnswer:
-        """Common posterior of some methods and the test of their agreement; `DivergenceError` without one."""
-        read = self.reader(names, bias_sd_s, freed)
-        fused = self.fused(read)
+        def scaled(values: Inputs) -> Inputs:
+            return {name: _FREED * x if name in freed else x for name, x in values.items()}
+
+        def read(inputs: Inputs, about: Deflection | None) -> list[Evidence]:
+            return [replace(one, by_input=scaled(one.by_input)) for one in reader(scaled(inputs), about)]
+
+        history, solution = fuse(read, knot_s=knots_of(self.loads))
         # at the stated inputs, but with the readings' slopes at the posterior's: far inputs are curved
-        inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
+        inputs = {name: mean for name, (mean, _) in solution.inputs.items()}
         back = {name: -mean for name, mean in inputs.items()}
-        stated = [moved_evidence(one, back, fused.deflection) for one in read(inputs, fused.deflection)]
-        faults = fault_hypotheses(self.loads, fused.input_posterior, CAMERA_PLANE_SD_RAD)
-        tests = agreement(stated, fused.input_posterior, fused.deflection, faults)
-        bias = _time_bias(fused, bias_sd_s, True) if CAMERA_TIME_BIAS in fused.inputs else None
-        limbs, remark = _limbs(fused.history, self.loads)
-        return FusedAnswer(**vars(fused), agreement=tests, limbs=limbs, limbs_remark=remark, camera_time_bias=bias)
+        stated = [moved_evidence(one, back, solution.deflection) for one in read(inputs, solution.deflection)]
+        faults = fault_hypotheses(self.loads, solution.input_posterior, CAMERA_PLANE_SD_RAD)
+        tests = agreement(stated, solution.input_posterior, solution.deflection, faults)
+        bias = _time_bias(solution, bias_sd_s, True) if CAMERA_TIME_BIAS in inputs else None
+        return Fused(history, solution, tests, reader, camera_time_bias=bias)
 
     def tested(self, fault: DivergenceError, bias_sd_s: float) -> Agreement:
         """Test of all methods' agreement without a common answer."""
@@ -308,7 +312,7 @@ class _Sources:
         return agreement(self.reader(self.names, bias_sd_s)({}, None), posterior, faults=faults)
 
 
-def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
+def _without_each(sources: _Sources, bias_sd_s: float) -> Fused | None:
     """Answer where all methods contradict each other: without the one at fault, or a mixture; None if there is none."""
     if len(sources.names) == 2:
         return _of_either(sources)
@@ -328,10 +332,10 @@ def _without_each(sources: _Sources, bias_sd_s: float) -> FusedAnswer | None:
         return None
     base = among.get("trim", next(iter(among.values())))
     histories = {f"without {name}": answer.history for name, answer in among.items()}
-    return _mixed(base, histories, np.ones(len(histories)), sources.loads)
+    return _mixed(base, histories, np.ones(len(histories)))
 
 
-def _of_either(sources: _Sources) -> FusedAnswer | None:
+def _of_either(sources: _Sources) -> Fused | None:
     """Mixture of misalignment alone and trim alone, each sample by sample: trim alone does not follow the joint."""
     histories = {
         "misalignment alone": estimate_misalignment(sources.loads),
@@ -339,13 +343,13 @@ def _of_either(sources: _Sources) -> FusedAnswer | None:
     }
     for name in sources.names:
         try:
-            return _mixed(sources.answer((name,), 0.0), histories, np.ones(2), sources.loads)
+            return _mixed(sources.answer((name,), 0.0), histories, np.ones(2))
         except DivergenceError:
             continue
     return None
 
 
-def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float) -> FusedAnswer:
+def _with_faults_freed(sources: _Sources, answer: Fused, bias_sd_s: float) -> Fused:
     """Mixture of the answer as stated and those without the likeliest faults' inputs, by their odds."""
     histories, odds = {"all inputs as stated": answer.history}, [1.0]
     for fault in answer.agreement.likeliest:
@@ -355,12 +359,10 @@ def _with_faults_freed(sources: _Sources, answer: FusedAnswer, bias_sd_s: float)
             continue
         histories[f"another {fault}"] = freed.history
         odds.append(float(np.exp(min(answer.agreement.gains[fault], _LARGEST_LOG))))
-    return _mixed(answer, histories, np.array(odds), sources.loads) if len(odds) > 1 else answer
+    return _mixed(answer, histories, np.array(odds)) if len(odds) > 1 else answer
 
 
-def _mixed(
-    answer: FusedAnswer, histories: dict[str, DeflectionHistory], weights: FloatArray, loads: FlightLoads
-) -> FusedAnswer:
+def _mixed(answer: Fused, histories: dict[str, DeflectionHistory], weights: FloatArray) -> Fused:
     """Answer with the mixture of several histories, at its own times; the covariance includes their differences."""
     t, own = answer.history.time_s, answer.history
     yz, cov, weight = [], [], []
@@ -379,8 +381,7 @@ def _mixed(
     apart = np.array(yz) - mean
     total = np.sum(share[..., None] * (np.array(cov) + apart[..., :, None] * apart[..., None, :]), axis=0)
     history = history_from_lateral(t, mean, total, own.method, own.assumptions)
-    limbs, remark = _limbs(history, loads)
-    return replace(answer, history=history, limbs=limbs, limbs_remark=remark, alternatives=tuple(histories))
+    return replace(answer, history=history, alternatives=tuple(histories))
 
 
 def _explained(
@@ -413,10 +414,11 @@ def _tested_time_bias(sources: _Sources) -> CameraTimeBias | None:
     without_trim = tuple(n for n in names if n != "trim")
     for sd_s, of in (*((sd_s, names) for sd_s in _WIDE_BIAS_SD_S), (wide_s, without_trim)):
         with contextlib.suppress(DivergenceError):
-            return _time_bias(sources.fused(sources.reader(of, sd_s)), sd_s, False)
+            _, solution = fuse(sources.reader(of, sd_s), knot_s=knots_of(sources.loads))
+            return _time_bias(solution, sd_s, False)
     return None
 
 
-def _time_bias(fused: Fused, prior_sd_s: float, applied: bool) -> CameraTimeBias:
-    mean, covariance = fused.inputs[CAMERA_TIME_BIAS]
+def _time_bias(solution: Solution, prior_sd_s: float, applied: bool) -> CameraTimeBias:
+    mean, covariance = solution.inputs[CAMERA_TIME_BIAS]
     return CameraTimeBias(prior_sd_s * float(mean[0]), prior_sd_s * float(np.sqrt(covariance[0, 0])), applied)

@@ -145,41 +145,6 @@ class Method(Protocol):
         """Readings of the method."""
 
 
-@dataclass(frozen=True)
-class Fused:
-    """Posterior of the deflection and of the inputs on which the methods depend.
-
-    Parameters
-    ----------
-    history : DeflectionHistory
-        At the times of the method with most samples.
-    input_posterior : InputPosterior
-        Of the inputs, given all readings.
-    correlation : (g, g) float
-        Of the inputs' leading unit normals and of the deflection's two components at ``at_s``, in order of ``names``.
-    names : tuple of str
-    at_s : float
-        Time of the smallest deflection sd.
-    deflection : Deflection
-    process_size_radps2 : float
-        Of the joint's acceleration at each knot, as this flight has it.
-    """
-
-    history: DeflectionHistory
-    input_posterior: InputPosterior
-    correlation: FloatArray
-    names: tuple[str, ...]
-    at_s: float
-    deflection: Deflection
-    process_size_radps2: float
-
-    @property
-    def inputs(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Mean (k,) and covariance (k, k) of each input's unit normals, given all readings."""
-        post = self.input_posterior
-        return {name: (post.mean[at], post.covariance[at, at]) for name, at in post.place.items()}
-
-
 class FarInputsError(DivergenceError):
     """Readings agree only with inputs far beyond their stated sd: ``input_posterior`` has which."""
 
@@ -196,8 +161,8 @@ def fuse(
     *,
     free_process: bool = True,
     knot_s: float = KNOT_S,
-) -> Fused:
-    """Fuse the methods' readings; one method alone is smoothed.
+) -> tuple[DeflectionHistory, Solution]:
+    """Fuse the methods' readings; one method alone is smoothed. Return the deflection's history, and the posterior.
 
     Parameters
     ----------
@@ -247,27 +212,27 @@ def fuse(
         if not free_process and step < _WHOLE_STEPS:  # then held: its own small changes would go on moving the inputs
             size_radps2 = problem.process_size()
         answer = problem.solved(size_radps2, method)
-        sd, size = answer.sd, 2 * problem.spline.count
-        new = {name: answer.of_inputs[place] for name, place in problem.place.items()}
-        moved = float((np.abs(answer.mean[:size] - before[:size]) / sd[:size]).max())
+        new = {name: mean for name, (mean, _) in answer.inputs.items()}
+        moved = float((np.abs(answer.mean - before) / answer.sd).max())
         for name in {e.time_bias for e in readings} & new.keys():
-            bias = np.abs(new[name] - inputs.get(name, 0.0)) / sd[size:][problem.place[name]]
+            bias = np.abs(new[name] - inputs.get(name, 0.0)) / np.sqrt(np.diag(answer.inputs[name][1]))
             moved = max(moved, float(bias.max()))
-        input_posterior = InputPosterior(answer.of_inputs, answer.inputs, problem.place)
         if moved < SETTLED_SD and step > 0:
             if free_process:
-                _check_inputs(new, input_posterior, method)
+                _check_inputs(new, answer.input_posterior, method)
+                answer = problem.smoothed(answer.input_posterior, method)
             densest = max(readings, key=lambda e: len(e.time_s)).time_s
             times = _without_holes(densest) if at_s is None else at_s
             times = times[_apart_from_readings(times, readings) <= near_s]
-            if free_process:
-                answer, size_radps2 = problem.smoothed(input_posterior, method)
-            return _posterior(answer, size_radps2, input_posterior, readings, method, times)
+            sources = ", ".join(e.method for e in readings)
+            remark = f"from {sources} with their shared errors; joint as a second-order process"
+            theta_yz, cov = answer.deflection(times), answer.lateral_cov(times)
+            return history_from_lateral(times, theta_yz, cov, method, remark), answer
         # whole Gauss-Newton steps first, then half steps, which cannot oscillate, about the smooth deflection: at the
         # ends of a long pulse the free one is off by ten degrees, where the methods are not linear, anew at each step
         part, smooth = 1.0 if step < _WHOLE_STEPS else 0.5, answer
         if free_process and step >= _WHOLE_STEPS:
-            smooth, _ = problem.smoothed(input_posterior, method)
+            smooth = problem.smoothed(answer.input_posterior, method)
         about = smooth.deflection
         inputs = {name: part * x + (1.0 - part) * inputs.get(name, 0.0 * x) for name, x in new.items()}
     raise DivergenceError(
@@ -302,7 +267,7 @@ def smoothed(
     first, last = np.ceil(known[0] * rate_hz), np.floor(known[-1] * rate_hz)
     one = evidence_of_history(history)
     at_s, near_s = np.arange(first, last + 1.0) / rate_hz, 0.5 * HOLE_FACTOR * float(np.median(np.diff(known)))
-    out = fuse(lambda _inputs, _about: [one], history.method, at_s, max(near_s, _NEAR_S)).history
+    out, _ = fuse(lambda _inputs, _about: [one], history.method, at_s, max(near_s, _NEAR_S))
     return out if swing_hz is None else with_unresolved_swing(history, out, swing_hz)
 
 
@@ -488,28 +453,3 @@ def _apart_from_readings(time_s: FloatArray, readings: list[Evidence]) -> FloatA
     """Distance (n,) of each time from the nearest reading of any method, s."""
     read = np.sort(np.concatenate([e.time_s for e in readings]))
     return np.abs(time_s - read[nearest_index(read, time_s)])
-
-
-def _posterior(
-    answer: Solution,
-    size_radps2: float,
-    input_posterior: InputPosterior,
-    readings: list[Evidence],
-    method: str,
-    t: FloatArray,
-) -> Fused:
-    size, place = 2 * answer.spline.count, input_posterior.place
-    value = answer.spline.rows(t)
-    theta_yz, cov = answer.deflection(t), answer.lateral_cov(value)
-    remark = f"from {', '.join(e.method for e in readings)} with their shared errors; joint as a second-order process"
-    history = history_from_lateral(t, theta_yz, cov, method, remark)
-    best = int(np.argmin(np.trace(cov, axis1=1, axis2=2)))
-    pick = np.zeros((2 + len(place), len(answer.mean)))
-    pick[0, 0:size:2] = pick[1, 1:size:2] = value[[best]].toarray()[0]
-    for k, at in enumerate(place.values()):
-        pick[2 + k, size + at.start] = 1.0
-    joint = answer.covariance_of(pick)
-    sd = np.sqrt(np.diag(joint))
-    names = ("deflection y", "deflection z", *place)
-    correlation = joint / np.outer(sd, sd)
-    return Fused(history, input_posterior, correlation, names, float(t[best]), answer.deflection, size_radps2)

@@ -40,9 +40,9 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array
 
 from estimators.balance import Swing, axial_residual
-from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Spline
+from estimators.deflection_spline import FREE_RADPS2, InputPosterior, Inputs, NormalEquations, Rows, Solution, Spline
 from estimators.evidence import Deflection, Evidence, corrected_loads, input_responses, swing_responses
-from estimators.fusion import Fused, LoadsReader, knots_of, places, shares_of_spans, span_of, whitened
+from estimators.fusion import LoadsReader, knots_of, places, shares_of_spans, span_of, whitened
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import AeroTable
 from flightmodel.atmosphere import DENSITY_LENGTH_M, unresolved_variance
@@ -172,15 +172,15 @@ class Increments:
         return np.asarray(pick @ self.posterior.covariance @ pick.T)
 
 
-def estimate_increments(reader: LoadsReader, fused: Fused) -> Increments:
+def estimate_increments(reader: LoadsReader, start: Solution) -> Increments:
     """Increments of all coefficients along the Mach numbers at which the deflection is read.
 
     Parameters
     ----------
     reader : LoadsReader
         Of the loads by all methods that read them, and of others' readings.
-    fused : Fused
-        Where to start.
+    start : Solution
+        Of the fusion.
 
     Raises
     ------
@@ -190,20 +190,20 @@ def estimate_increments(reader: LoadsReader, fused: Fused) -> Increments:
     reader = _instantaneous(reader)
     vehicle, mach = reader.pulse.vehicle, reader.pulse.mach
     processes = Processes.over(mach, vehicle.uncertainty)
-    deflection, inputs = fused.deflection, _from_factors(processes, fused)
+    deflection, inputs = start.deflection, _from_factors(processes, start)
     roots, before = processes.roots(), np.inf
     for _ in range(_MOST_STEPS):
         increments = np.array([root @ inputs[name] for name, root in zip(COEFFICIENTS, roots, strict=True)])
         flown = replace(vehicle, aero=processes.flown(vehicle.aero, increments))
         normal = _equations(reader.with_vehicle(flown), deflection, inputs, _Slopes(processes, roots, increments))
         answer = normal.solved(FREE_RADPS2, "aerodynamic increments")
-        mean, found = answer.of_inputs, answer.deflection
+        mean, found = answer.input_posterior.mean, answer.deflection
         step = mean.copy()
         for name, place in normal.place.items():
             step[place] -= inputs.get(name, 0.0)
         moved = float(np.linalg.norm(answer.factor.corner.T @ step))
         if moved < _SETTLED_SD:
-            return Increments(processes, InputPosterior(mean, answer.inputs, normal.place))
+            return Increments(processes, answer.input_posterior)
         if moved > 0.5 * before:  # whole steps lead to and fro between two points
             mean, found = mean - 0.5 * step, _halfway(deflection, found)
         deflection, before = found, moved
@@ -249,9 +249,9 @@ def _instantaneous(reader: LoadsReader) -> LoadsReader:
     return replace(reader, pulse=moved(reader.pulse), smooth=moved(even))
 
 
-def _from_factors(processes: Processes, fused: Fused) -> Inputs:
+def _from_factors(processes: Processes, start: Solution) -> Inputs:
     """Fused inputs, one factor of each coefficient as the processes' unit normals of a constant."""
-    inputs = {name: mean for name, (mean, _) in fused.inputs.items()}
+    inputs = {name: mean for name, (mean, _) in start.inputs.items()}
     for name, root, sd in zip(COEFFICIENTS, processes.roots(), processes.stated_sd, strict=True):
         factor = float(inputs[name][0]) if name in inputs else 0.0
         inputs[name] = np.linalg.lstsq(root, np.full(len(root), sd * factor))[0]

@@ -18,7 +18,7 @@ import numpy as np
 
 from flightmodel import rotations
 from flightmodel.airdata import pressure_pulse
-from flightmodel.checks import BoolArray, FloatArray, GateError, check_finite, check_increasing, check_shape
+from flightmodel.checks import BoolArray, FloatArray, GateError, check_increasing, check_shape
 from flightmodel.earth import STANDARD_GRAVITY_MPS2
 from flightmodel.instruments import LoadsErrors
 from flightmodel.vehicle import Vehicle
@@ -131,6 +131,17 @@ class FlightLoads:
         return -self.specific_force_body_mps2[:, 0] >= MIN_AXIAL_MPS2
 
     @property
+    def alpha_total_wind_rad(self) -> FloatArray:
+        """Total angle of attack of the centerbody, wind-relative (n,)."""
+        return lateral_and_size(self.flow_yz_rad)[1]
+
+    @property
+    def alpha_total_wind_sd_rad(self) -> FloatArray:
+        """Standard deviation (n,) of the total angle of attack."""
+        towards, _ = lateral_and_size(self.flow_yz_rad)
+        return np.sqrt(np.einsum("ni,nij,nj->n", towards, self.flow_cov, towards))
+
+    @property
     def quarter_swing_s(self) -> float:
         """A quarter of the fastest swing's period, at least the samples' spacing, s; infinite where it is not given."""
         if self.swing_radps == 0.0 or len(self.time_s) < 2:
@@ -196,22 +207,12 @@ class LoadsColumns:
     wind_sd_mps: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        """Check shapes, numbers and the order of times once."""
-        n = len(self.time_s)
-        widths = {"specific_force_body_mps2": (3,), "rate_body_radps": (3,), "flow_yz_rad": (2,)}
-        for field_ in fields(self):
-            value = getattr(self, field_.name)
-            if value is not None:
-                name = f"loads.{field_.name}"
-                check_finite(name, check_shape(name, value, (n, *widths.get(field_.name, ()))))
+        """Check the order of times once."""
         check_increasing("loads.time_s", self.time_s)
 
 
 def loads_from_arrays(
-    vehicle: Vehicle,
-    stated: LoadsColumns,
-    errors: LoadsErrors | None = None,
-    cg_from_sensor_m: FloatArray | None = None,
+    vehicle: Vehicle, stated: LoadsColumns, errors: LoadsErrors, cg_from_sensor_m: FloatArray
 ) -> FlightLoads:
     """Loads of a flight whose trajectory somebody else made.
 
@@ -220,10 +221,10 @@ def loads_from_arrays(
     vehicle : Vehicle
         Pre-flight model.
     stated : LoadsColumns
-    errors : LoadsErrors, optional
-        Of what is not stated; the defaults else.
-    cg_from_sensor_m : (3,) float, optional
-        From the accelerometer to the c.g. of the undeflected vehicle, body axes; at the c.g. without.
+    errors : LoadsErrors
+        Of what is not stated.
+    cg_from_sensor_m : (3,) float
+        From the accelerometer to the c.g. of the undeflected vehicle, body axes, m.
 
     Raises
     ------
@@ -232,8 +233,6 @@ def loads_from_arrays(
     """
     if len(stated.time_s) < LEAST_ROWS:
         raise GateError(f"loads: {len(stated.time_s)} rows; at least {LEAST_ROWS} are wanted", "too-few-data")
-    errors = errors or LoadsErrors()
-    arm = np.zeros(3) if cg_from_sensor_m is None else np.asarray(cg_from_sensor_m, dtype=float)
     t, h, force, rate, turn = _on_grid(stated)
 
     def at(values: FloatArray) -> FloatArray:
@@ -257,7 +256,7 @@ def loads_from_arrays(
     peak = int(np.argmax(pressure))
     return FlightLoads(
         time_s=t,
-        specific_force_body_mps2=force + rotations.lever_arm_acceleration(rate, turn, arm),
+        specific_force_body_mps2=force + rotations.lever_arm_acceleration(rate, turn, cg_from_sensor_m),
         force_noise_sd_mps2=noise / np.sqrt(samples),
         force_root_mps2=force_root,
         flow_root_rad=flow_root,
@@ -277,7 +276,7 @@ def loads_from_arrays(
         point_from_datum_m=vehicle.cg_m,
         accelerometer_time_bias_sd_s=errors.time_bias_sd_s,
         gyro_time_bias_sd_s=errors.time_bias_sd_s,
-        cg_from_sensor_m=arm,
+        cg_from_sensor_m=cg_from_sensor_m,
         half_window_s=h,
         swing_radps=pitching_radps(vehicle, float(mach[peak]), float(pressure[peak]), float(rate[peak, 0])),
     )

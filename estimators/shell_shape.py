@@ -57,7 +57,7 @@ from estimators.camera_fit import OrientedCamera
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.frame_residuals import ROUND_WAVES, WAVES
 from estimators.frame_solution import AprioriSd, FrameFit
-from flightmodel.checks import BoolArray, FloatArray, GateError
+from flightmodel.checks import BoolArray, FloatArray, GateError, IntArray
 from flightmodel.statistics import correlation, mixture_moments, paired_covariance, symmetric_root
 
 _PARTS = [(w, f"{w} waves across the shell") for w in WAVES] + [(w, f"{w} waves of its radius") for w in ROUND_WAVES]
@@ -81,30 +81,21 @@ _UNSEEN = 1e-10  # of the largest information: a shape that the points do not sh
 _JITTER_RAD2 = float(np.deg2rad(1e-4) ** 2)  # where a frame shows nothing of a shape, what it found is exactly zero
 
 
-@dataclass(frozen=True)
-class LoadedFilm:
-    """A film and the dynamic pressure at its frames (n,), Pa."""
+def _alike(film: FilmFit) -> FloatArray:
+    """Correlation (n,) of a frame's own part with the benchmark frame's."""
+    return np.asarray(np.exp(-np.abs(film.time_s - film.benchmark_s) / LIGHT_TIME_S))
 
-    film: FilmFit
-    pressure_pa: FloatArray
 
-    @property
-    def with_benchmark(self) -> FloatArray:
-        """Correlation (n,) of a frame's own part with the benchmark frame's."""
-        return np.asarray(np.exp(-np.abs(self.film.time_s - self.film.benchmark_s) / LIGHT_TIME_S))
+def load_shares(film: FilmFit, largest_pa: float) -> FloatArray:
+    """Loads ``l`` (n,) relative to the benchmark frame's, over the largest of all films."""
+    at = int(np.argmin(np.abs(film.time_s - film.benchmark_s)))
+    return np.asarray((film.pressure_pa - film.pressure_pa[at]) / largest_pa)
 
-    def shares(self, largest_pa: float) -> FloatArray:
-        """Loads ``l`` (n,) relative to the benchmark frame's, over the largest of all films."""
-        at = int(np.argmin(np.abs(self.film.time_s - self.film.benchmark_s)))
-        return np.asarray((self.pressure_pa - self.pressure_pa[at]) / largest_pa)
 
-    @property
-    def rows(self) -> FloatArray:
-        """Frames with an answer whose load is known, `_MOST_FRAMES` at the most."""
-        known = [
-            k for k, fit in enumerate(self.film.fits) if fit.shape is not None and np.isfinite(self.pressure_pa[k])
-        ]
-        return np.array(known[:: max(1, -(-len(known) // _MOST_FRAMES))], dtype=int)
+def _loaded(film: FilmFit) -> IntArray:
+    """Frames with an answer whose load is known, `_MOST_FRAMES` at the most."""
+    known = [k for k, fit in enumerate(film.fits) if fit.shape is not None and np.isfinite(film.pressure_pa[k])]
+    return np.array(known[:: max(1, -(-len(known) // _MOST_FRAMES))], dtype=int)
 
 
 @dataclass(frozen=True)
@@ -213,32 +204,32 @@ class ShellShape:
         return pd.DataFrame({"mode": MODES, **columns, "probability": found, "determined": self.determined})
 
 
-def shell_shape(films: list[LoadedFilm]) -> ShellShape:
+def shell_shape(films: list[FilmFit]) -> ShellShape:
     """Amplitudes of the shell's shape under load and the odds of the hypotheses.
 
     Parameters
     ----------
-    films : list of LoadedFilm
-        Of one shell; the planes estimated.
+    films : list of FilmFit
+        Of one shell, with their dynamic pressure; the planes estimated.
 
     Raises
     ------
     GateError
         Where frames are too few, or their loads too equal.
     """
-    frames = sum(len(one.rows) for one in films)
+    frames = sum(len(_loaded(one)) for one in films)
     if frames < LEAST_FRAMES:
         raise GateError(f"{frames} frames with a load where {LEAST_FRAMES} are needed", code="too-few-data")
     largest = max(float(np.nanmax(one.pressure_pa)) for one in films)
-    loads = np.concatenate([one.shares(largest)[one.rows] for one in films])
+    loads = np.concatenate([load_shares(one, largest)[_loaded(one)] for one in films])
     if np.ptp(loads) < _LEAST_LOAD:
         raise GateError(
             f"the dynamic pressure of the frames varies by {100.0 * np.ptp(loads):.0f} % of the largest where "
             f"{100.0 * _LEAST_LOAD:.0f} % are needed",
             code="loads-alike",
         )
-    prior = mode_sd_rad(films[0].film.oriented.apriori)
-    stacked = {number: _Stacked.of(one, largest) for number, one in enumerate(films) if len(one.rows)}
+    prior = mode_sd_rad(films[0].oriented.apriori)
+    stacked = {number: _Stacked.of(one, largest) for number, one in enumerate(films) if len(_loaded(one))}
     answers = []
     for sizes in _SIZES:
         prior_sd = np.append(prior, np.full(len(films) * len(MODES), sizes[-1]))
@@ -266,20 +257,20 @@ class _Stacked:
     own: FloatArray
 
     @staticmethod
-    def of(one: LoadedFilm, largest_pa: float) -> _Stacked:
+    def of(film: FilmFit, largest_pa: float) -> _Stacked:
         """``new``, ``lasting``: of the formal size; ``own``: of unit own shapes given the benchmark frame's."""
-        rows, oriented = one.rows, one.film.oriented
-        fits = [one.film.fits[k].shape for k in rows]
+        rows, oriented = _loaded(film), film.oriented
+        fits = [film.fits[k].shape for k in rows]
         formal = np.array([fit.formal[2:, 2:] for fit in fits])
         share = _share_found(formal, oriented.apriori)
-        noise, time_s, alike = share @ formal, one.film.time_s[rows], one.with_benchmark[rows]
+        noise, time_s, alike = share @ formal, film.time_s[rows], _alike(film)[rows]
         root = symmetric_root(0.5 * (noise + noise.transpose(0, 2, 1)))
         camera = np.concatenate([fit.by_camera[2:] for fit in fits])
         start = np.concatenate([fit.by_benchmark[2:] for fit in fits]) * oriented.apriori.benchmark_rad
         light, together = np.array([fit.by_light[2:] for fit in fits]), correlation(time_s, LIGHT_TIME_S, CONSTANT_PART)
         return _Stacked(
             np.array([fit.found_rad[2:] for fit in fits]).ravel(),
-            (share * one.shares(largest_pa)[rows, None, None]).reshape(-1, len(MODES)),
+            (share * load_shares(film, largest_pa)[rows, None, None]).reshape(-1, len(MODES)),
             (share * (1.0 - alike)[:, None, None]).reshape(-1, len(MODES)),
             block_diag(*noise),
             paired_covariance(root, together, root),
@@ -352,23 +343,23 @@ def _mixed(answers: list[_Amplitudes], prior_sd: FloatArray, largest_pa: float) 
     return ShellShape(mean, covariance, if_any, sd, probability, size, scale, determined, largest_pa)
 
 
-def with_shape(films: list[LoadedFilm], shape: ShellShape) -> list[FilmFit]:
+def with_shape(films: list[FilmFit], shape: ShellShape) -> list[FilmFit]:
     """Films with the answers of all frames given the shell's shape under their load, in the order of `shell_shape`."""
-    return [_with_shape(one, number, shape) for number, one in enumerate(films)]
+    return [_with_shape(film, number, shape) for number, film in enumerate(films)]
 
 
-def _with_shape(one: LoadedFilm, number: int, shape: ShellShape) -> FilmFit:
+def _with_shape(film: FilmFit, number: int, shape: ShellShape) -> FilmFit:
     # of amplitudes and benchmarks' own shapes: what each frame shows of them
-    parts = np.zeros((len(one.film.fits), len(shape.found_rad) // len(MODES)))
-    parts[:, 0], parts[:, 1 + number] = one.shares(shape.largest_pa), 1.0 - one.with_benchmark
-    own = shape.frame_sd_rad**2 * np.maximum(1.0 - one.with_benchmark**2, _LEAST_OWN)
+    parts, alike = np.zeros((len(film.fits), len(shape.found_rad) // len(MODES))), _alike(film)
+    parts[:, 0], parts[:, 1 + number] = load_shares(film, shape.largest_pa), 1.0 - alike
+    own = shape.frame_sd_rad**2 * np.maximum(1.0 - alike**2, _LEAST_OWN)
     fits = tuple(
         fit
         if fit.shape is None or not np.isfinite(part[0])
-        else _given_shape(fit, part, float(var), shape, one.film.oriented)
-        for fit, part, var in zip(one.film.fits, parts, own, strict=True)
+        else _given_shape(fit, part, float(var), shape, film.oriented)
+        for fit, part, var in zip(film.fits, parts, own, strict=True)
     )
-    return replace(one.film, fits=fits, shape_covariance=shape.found_covariance)
+    return replace(film, fits=fits, shape_covariance=shape.found_covariance)
 
 
 def _given_shape(

@@ -136,7 +136,7 @@ def solve_trim(model: TrimModel, mach: FloatArray, flow_yz_rad: FloatArray, mome
 
 def moment_term(model: TrimModel, loads: FlightLoads) -> FloatArray:
     """``u / C_A`` as lateral vectors ``(n, 2)``, m, of the undeflected vehicle's motion."""
-    alpha = np.minimum(np.linalg.norm(loads.flow_yz_rad, axis=1), np.pi)
+    alpha = np.minimum(loads.alpha_total_wind_rad, np.pi)
     coefficients = model.aero.at(loads.mach, alpha)
     w, turn = loads.rate_body_radps, loads.angular_acceleration_body_radps2
     moment = turn @ model.inertia_kgm2.T + np.cross(w, w @ model.inertia_kgm2.T)

@@ -309,7 +309,7 @@ def _answered(
     camera: Task[CameraAnswer] | None = None
     time_bias: Task[CameraTimeBias | None] | None = None
     if film is not None:
-        camera = beside.submit("postflight.filming:answer_of_film", there, film)
+        camera = beside.submit("postflight.filming:camera_answer", there, film)
         if "fused" in methods:
             time_bias = beside.submit("postflight.filming:time_bias_of", there, camera)
     figures.draw("trajectory")  # which comes after the camera
@@ -470,7 +470,7 @@ def print_answers(answers: Deflections) -> None:
     if answers.doubt:
         console.coded("[red]in doubt[/]", answers.doubt, "answers-in-doubt")
     at_s, cycle = answers.reference_s, answers.cycle_s
-    summary = run_folder.method_summary(answers, at_s)
+    summary = run_folder.method_summary(answers)
     here, peak = ("at peak q", "peak q at") if answers.knows_peak else ("there", "no trajectory was made; largest at")
     title = f"Deflection of the aeroshell against the centerbody, deg: {peak} {at_s:.2f} s"
     title += f"{'' if cycle is None else f', cycle from {cycle[0]:.2f} to {cycle[1]:.2f} s'}; plane in deg LV"

@@ -25,7 +25,7 @@ from recon.consistency import doubt
 
 if TYPE_CHECKING:  # estimators are a quarter of a second to import, for commands that only have or read a trajectory
     from estimators.agreement import Agreement
-    from estimators.fusing import CameraTimeBias, FusedAnswer
+    from estimators.fusing import CameraTimeBias, Fused
     from postflight.filming import CameraAnswer
     from postflight.flown_coefficients import AeroIncrements
 
@@ -50,7 +50,7 @@ class Deflections(Tabular):
         By method: ``"camera"``, ``"misalignment"``, ``"trim"``, ``"fused"``.
     refused : dict of Issue
         Why a method gave none.
-    fused : FusedAnswer or None
+    fused : Fused or None
         Posterior of the deflection and of all inputs, and whether the methods agree.
     camera : CameraAnswer or None
         What stands behind the camera's, of one camera or several.
@@ -68,7 +68,7 @@ class Deflections(Tabular):
 
     histories: dict[str, DeflectionHistory] = field(default_factory=dict)
     refused: dict[str, Issue] = field(default_factory=dict)
-    fused: FusedAnswer | None = None
+    fused: Fused | None = None
     camera: CameraAnswer | None = field(default=None, compare=False)
     smooth_camera: DeflectionHistory | None = field(default=None, compare=False)
     bet: Reconstruction | None = None
@@ -273,8 +273,8 @@ def estimate_camera(flown: Flight | Reconstruction, progress: Progress | None = 
 
     check_type("estimate_camera", flown, (Flight, Reconstruction), f"{READ}, {FILM} or {RECONSTRUCT}")
     if isinstance(flown, Flight):
-        return camera_answer(flown, None, progress).plain
-    return camera_answer(flown.flight, flown, progress).history
+        return camera_answer(flown, progress=progress).plain
+    return camera_answer(flown, progress=progress).history
 
 
 @on_one_thread
@@ -330,15 +330,10 @@ def fuse(flown: Reconstruction | FlightLoads | Flight, progress: Progress | None
     Deflections
         ``.history`` is the fused one; a method without an answer is in ``.refused`` with its reason.
     """
-    if not _has_loads(flown):
+    if not (isinstance(flown, Flight) and flown.loads is not None):
         check_type("fuse", flown, (Reconstruction, FlightLoads), LOADS)
     has_film = not isinstance(flown, FlightLoads) and flown.telemetry.frames is not None
     return estimate(flown, tuple(m for m in METHODS if m != "camera" or has_film), progress)
-
-
-def _has_loads(flown: object) -> bool:
-    """Whether this is a flight with a table of loads."""
-    return isinstance(flown, Flight) and flown.loads is not None
 
 
 def _loads_of(name: str, flown: Reconstruction | FlightLoads | Flight | None) -> FlightLoads:
@@ -367,63 +362,52 @@ def estimate(
     """
     report = progress or (lambda _fraction, _what: None)
     bet = flown if isinstance(flown, Reconstruction) else None
-    loads = flown if isinstance(flown, FlightLoads) else flown.loads if isinstance(flown, Flight) else None
     flight = flown if isinstance(flown, Flight) else None if bet is None else bet.flight
-    answers = Deflections(bet=bet, loads=loads)
+    histories: dict[str, DeflectionHistory] = {}
+    refused: dict[str, Issue] = {}
     fused, filmed = None, None
-    missing = _inputs(flight, loads).missing()
+    loads = flown if isinstance(flown, FlightLoads) else flown.loads if isinstance(flown, Flight) else None
+    missing = Inputs.of(flown if isinstance(flown, FlightLoads) else flown.telemetry).missing()
     for k, method in enumerate(sorted(methods, key=_AS_RUN.index)):
         report(k / len(methods), f"deflection from {method}")
         try:
             if method in missing:
                 raise GateError([missing[method]])
             if method == "camera":
-                assert flight is not None  # whose film it is
+                assert not isinstance(flown, FlightLoads)  # which are never filmed
                 from postflight.filming import camera_answer, keep_oriented
 
                 shown = part_of(report, k / len(methods), (k + 1) / len(methods))
-                filmed = camera_answer(flight, bet, shown) if camera is None else camera.result()
-                keep_oriented(flight.telemetry, filmed.oriented)
+                filmed = camera_answer(flown, progress=shown) if camera is None else camera.result()
+                keep_oriented(flown.telemetry, filmed.oriented)
                 history = filmed.history
-            elif bet is None and loads is None:
-                raise GateError(f"{method}: needs a trajectory, or loads (pf.read_loads)", "input-missing")
-            elif method == "misalignment":
-                history = estimate_misalignment(_loads_of(method, bet or loads))
-            elif method == "trim":
-                history = estimate_trim(_loads_of(method, bet or loads))
-            else:
+            elif method == "fused":
                 from estimators.fusing import fuse_flight
 
                 # the fusion estimates the deflection at the benchmark itself
-                used = filmed is not None and "camera" in answers.histories
+                used = filmed is not None and "camera" in histories
                 own = filmed.plain if filmed is not None and used else None
-                if own is None and flight is not None and "camera" not in answers.refused:
+                if own is None and flight is not None and "camera" not in refused:
                     own = camera_for_fusion(flight)
                 bias_sd_s = 0.0 if flight is None else _time_bias_sd_s(flight)
-                fused = fuse_flight(_loads_of("fuse", bet or loads), own, bias_sd_s, time_bias if used else None)
+                fused = fuse_flight(_loads_of("fuse", flown), own, bias_sd_s, time_bias if used else None)
                 history = fused.history
+            else:
+                history = (estimate_misalignment if method == "misalignment" else estimate_trim)(flown)
         except GateError as fault:
-            answers.refused[method] = Issue(str(fault), fault.codes[0])
+            refused[method] = Issue(str(fault), fault.codes[0])
             continue
-        answered = np.isfinite(history.theta_rad)
         if method == "camera" and filmed is not None and filmed.has_only_benchmarks:
             words = f"no frame but the benchmark frame can be used ({history.assumptions})"
-            answers.refused[method] = Issue(words, "too-few-data")
-        elif answered.any():
-            answers.histories[method] = history
+            refused[method] = Issue(words, "too-few-data")
+        elif np.isfinite(history.theta_rad).any():
+            histories[method] = history
         else:
-            answers.refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
+            refused[method] = Issue(f"no sample has an answer ({history.assumptions})", "no-answer")
     report(1.0, "estimated")
-    histories = {m: answers.histories[m] for m in methods if m in answers.histories}
-    refused = {m: answers.refused[m] for m in methods if m in answers.refused}
-    smooth = filmed.smooth if filmed is not None and "camera" in histories else None
-    return replace(answers, histories=histories, refused=refused, fused=fused, camera=filmed, smooth_camera=smooth)
-
-
-def _inputs(flight: Flight | None, loads: FlightLoads | None) -> Inputs:
-    """Available inputs of a flight, or of a table of loads."""
-    given = loads if flight is None else flight.telemetry
-    return Inputs() if given is None else Inputs.of(given)
+    histories = {m: histories[m] for m in methods if m in histories}
+    refused = {m: refused[m] for m in methods if m in refused}
+    return Deflections(histories, refused, fused, filmed, None if filmed is None else filmed.smooth, bet, loads)
 
 
 def with_increments(answers: Deflections) -> Deflections:
@@ -464,7 +448,7 @@ def aero_increments(bet: Reconstruction, answers: Deflections | None = None) -> 
     return _increments(found.fused, bet)
 
 
-def _increments(fused: FusedAnswer, bet: Reconstruction) -> AeroIncrements:
+def _increments(fused: Fused, bet: Reconstruction) -> AeroIncrements:
     """Increments; if there are none and the film's clock is off, the error names the clock first."""
     from postflight.flown_coefficients import increments_of
 
@@ -488,10 +472,9 @@ def fused_history(bet: Reconstruction, camera: DeflectionHistory | None) -> Defl
     untested: Future[CameraTimeBias | None] = Future()
     untested.set_result(None)
     try:
-        answer = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested)
+        found = fuse_flight(bet.required_loads(), camera, _time_bias_sd_s(bet.flight), untested).history
     except GateError:
         return None
-    found = answer.history
     return found if np.isfinite(found.theta_rad).any() else None
 
 

@@ -21,7 +21,7 @@ from estimators.cameras import CameraReadings, JoinedCameras, join_cameras
 from estimators.frame_edits import edited
 from estimators.fusing import CAMERA_PLANE_SD_RAD, CameraTimeBias, time_bias_if_free
 from estimators.fusion import smoothed
-from estimators.shell_shape import LoadedFilm, ShellShape, shell_shape, with_shape
+from estimators.shell_shape import ShellShape, shell_shape, with_shape
 from estimators.unloaded_frames import rest_check
 from flightmodel.checks import Check, DivergenceError, GateError, Issue, Progress, part_of
 from flightmodel.deflection import DeflectionHistory
@@ -55,8 +55,6 @@ class CameraAnswer:
         What became of every frame: ``camera`` and the columns of `FilmFit.frame_table`.
     joined : JoinedCameras or None
         None of one camera alone.
-    refused : dict of Issue
-        Cameras whose film cannot be used, and why.
     benchmarks_s : tuple of float
         Times of the benchmark frames.
     shape : ShellShape or None
@@ -73,7 +71,6 @@ class CameraAnswer:
     smooth: DeflectionHistory | None
     frames: pd.DataFrame
     joined: JoinedCameras | None
-    refused: dict[str, Issue]
     benchmarks_s: tuple[float, ...]
     shape: ShellShape | None = None
     consistency_checks: tuple[Check, ...] = ()
@@ -147,54 +144,73 @@ def joint_swing(vehicle: Vehicle) -> JointSwing | None:
 
 
 def camera_answer(
-    flight: Flight, bet: Reconstruction | None, progress: Progress | None = None, film: FilmFit | None = None
+    flown: Flight | Reconstruction, film: FilmFit | None = None, progress: Progress | None = None
 ) -> CameraAnswer:
     """Deflection by the flight's cameras.
 
     Parameters
     ----------
-    flight : Flight
-    bet : Reconstruction or None
-        Without it the benchmark frames are taken as undeflected.
-    progress : callable, optional
+    flown : Flight or Reconstruction
+        Without a trajectory the benchmark frames are taken as undeflected.
     film : FilmFit, optional
         What the film of the flight's one camera shows, where it is read already.
+    progress : callable, optional
 
     Raises
     ------
     GateError
         Where there is no video, or none that can be used.
     """
-    films = flight.telemetry.films
-    if len(films) < 2:
-        film = camera_film(flight, progress=progress) if film is None else film
-        name = next(iter(films))
-        shaped, shape, why = _with_shell_shape({name: film}, flight, bet)
-        film = shaped[name]
-        found, uncorrected = _benchmark(film, flight.telemetry.films[name].time_bias_sd_s, flight, bet)
-        history = film.history(found)
-        checks = [
-            *_rests("camera", name, film, history, bet, found is not None),
-            *_features("camera", name, film, flight),
-        ]
-        plane = plane_check(film)
-        history = replace(history, assumptions=f"{history.assumptions}{uncorrected}; {why}")
-        table = film.frame_table(history)
-        table.insert(0, "camera", name)
-        smooth = _smooth(flight, history)
-        return CameraAnswer(
-            history, film.history(), smooth, table, None, {}, (film.benchmark_s,), shape,
-            (*checks, *(() if plane is None else (plane,))), {name: film.oriented},
-        )  # fmt: skip
-    if flight.camera_plane_lv_rad is not None:
+    flight, bet = (flown, None) if isinstance(flown, Flight) else (flown.flight, flown)
+    telemetry = flight.telemetry
+    several = len(telemetry.films) > 1
+    if several and flight.camera_plane_lv_rad is not None:
         words = "several cameras estimate the plane; assume none, or leave one camera in flight.toml"
         raise GateError(words, "keys-conflict")
-    return _of_several(flight, bet, progress)
-
-
-def answer_of_film(bet: Reconstruction, film: FilmFit) -> CameraAnswer:
-    """`camera_answer` of a flight whose film is read."""
-    return camera_answer(bet.flight, bet, film=film)
+    refused: dict[str, Issue] = {}
+    if several:
+        films, refused = _usable_films(flight, progress)
+    else:
+        film = camera_film(flight, progress=progress) if film is None else film
+        films = dict.fromkeys(telemetry.films, film)
+    if bet is not None:
+        for name, one in films.items():
+            at_pa = np.interp(one.time_s, bet.air.time_s, bet.air.dynamic_pressure_pa, left=np.nan, right=np.nan)
+            films[name] = replace(one, pressure_pa=at_pa)
+    films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
+    benchmarks, histories, tables = {}, {}, []
+    rests: list[Check] = []
+    features: list[Check] = []
+    for name, film in films.items():
+        benchmarks[name], why = _benchmark(film, telemetry.films[name].time_bias_sd_s, flight, bet)
+        history = film.history(benchmarks[name])
+        histories[name] = replace(history, assumptions=f"{history.assumptions}{why}")
+        source = name if several else "camera"
+        rests += _rests(source, name, film, history, bet, benchmarks[name] is not None)
+        features += _features(source, name, film, flight)
+        tables.append(film.frame_table(history))
+        tables[-1].insert(0, "camera", name)
+    joined = None
+    if several:
+        joined, at_plain = _joined(flight, films, benchmarks)
+        used = {one.name for one in joined.readings}
+        refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in films if name not in used}
+        remarks = [f"{name}: {history.assumptions}" for name, history in histories.items()]
+        remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
+        words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
+        history, plain = replace(joined.at_frames, assumptions=words), at_plain.at_frames
+        smooth: DeflectionHistory | None = replace(joined.smooth, assumptions=words)
+        last = _of_all(joined, refused)
+    else:
+        ((name, film),) = films.items()
+        history = replace(histories[name], assumptions=f"{histories[name].assumptions}; {words_of_shape}")
+        plain, smooth = film.history(), _smooth(flight, history)
+        last = [check for check in (plane_check(film),) if check is not None]
+    return CameraAnswer(
+        history, plain, smooth, pd.concat(tables, ignore_index=True), joined,
+        tuple(film.benchmark_s for film in films.values()), shape, (*rests, *features, *last),
+        {name: film.oriented for name, film in films.items()},
+    )  # fmt: skip
 
 
 def time_bias_of(bet: Reconstruction, camera: CameraAnswer) -> CameraTimeBias | None:
@@ -202,7 +218,8 @@ def time_bias_of(bet: Reconstruction, camera: CameraAnswer) -> CameraTimeBias | 
     return time_bias_if_free(bet.required_loads(), camera.plain)
 
 
-def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress | None) -> CameraAnswer:
+def _usable_films(flight: Flight, progress: Progress | None) -> tuple[dict[str, FilmFit], dict[str, Issue]]:
+    """Fits of the films of several cameras, and why others cannot be used; `GateError` where none can."""
     films: dict[str, FilmFit] = {}
     refused: dict[str, Issue] = {}
     of_flight = flight.telemetry.films
@@ -216,38 +233,20 @@ def _of_several(flight: Flight, bet: Reconstruction | None, progress: Progress |
             refused[name] = Issue(str(fault), fault.codes[0])
     if not films:
         raise GateError([Issue(f"{name}: {reason}", reason.code) for name, reason in refused.items()])
-    films, shape, words_of_shape = _with_shell_shape(films, flight, bet)
-    plain, corrected, tables, remarks = [], [], [], []
-    rests: list[Check] = []
+    return films, refused
+
+
+def _joined(
+    flight: Flight, films: dict[str, FilmFit], benchmarks: dict[str, BenchmarkDeflection | None]
+) -> tuple[JoinedCameras, JoinedCameras]:
+    """One answer of several cameras: with the benchmark frames' deflection, and with these taken as undeflected."""
+    plain = []
     for name, film in films.items():
-        late_s = flight.telemetry.films[name].time_bias_sd_s
-        read, nothing = film.relative_to_benchmark(late_s), film.oriented.apriori.benchmark_rad**2 * np.eye(2)
-        one = CameraReadings(name, read, BenchmarkDeflection(np.zeros(2), nothing), float(CAMERA_PLANE_SD_RAD))
-        found, why = _benchmark(film, late_s, flight, bet)
-        history = film.history(found)
-        rests += _rests(name, name, film, history, bet, found is not None)
-        table = film.frame_table(history)
-        table.insert(0, "camera", name)
-        tables.append(table)
-        plain.append(one)
-        corrected.append(one if found is None else replace(one, benchmark=found))
-        remarks.append(f"{name}: {history.assumptions}{why}")
-    swing = joint_swing(flight.telemetry.required_vehicle())
-    hz = None if swing is None else swing.frequency_hz
-    joined = join_cameras(corrected, hz)
-    known = any(one is not two for one, two in zip(corrected, plain, strict=True))
-    at_plain = join_cameras(plain, hz) if known else joined
-    unused = {one.name for one in plain} - {one.name for one in joined.readings}
-    refused |= {name: Issue("too few frames with an answer", "too-few-data") for name in unused}
-    remarks += [f"{name}: no answer ({reason})" for name, reason in refused.items()]
-    words = "; ".join([joined.at_frames.assumptions, joined.remark, words_of_shape, *remarks])
-    history, smooth = (replace(h, assumptions=words) for h in (joined.at_frames, joined.smooth))
-    times, frames = tuple(film.benchmark_s for film in films.values()), pd.concat(tables, ignore_index=True)
-    checks = [*rests, *(check for name, film in films.items() for check in _features(name, name, film, flight))]
-    return CameraAnswer(
-        history, at_plain.at_frames, smooth, frames, joined, refused, times, shape,
-        (*checks, *_of_all(joined, refused)), {name: film.oriented for name, film in films.items()},
-    )  # fmt: skip
+        read = film.relative_to_benchmark(flight.telemetry.films[name].time_bias_sd_s)
+        plain.append(CameraReadings(name, read, film.undeflected_benchmark, float(CAMERA_PLANE_SD_RAD)))
+    corrected = [replace(one, benchmark=benchmarks[one.name] or one.benchmark) for one in plain]
+    joined = join_cameras(corrected, _swing_hz(flight))
+    return joined, join_cameras(plain, _swing_hz(flight)) if any(benchmarks.values()) else joined
 
 
 def _of_all(joined: JoinedCameras, refused: dict[str, Issue]) -> list[Check]:
@@ -271,19 +270,11 @@ def _with_shell_shape(
             raise GateError("no trajectory was made", "input-missing")
         if flight.camera_plane_lv_rad is not None:
             raise GateError("a plane is assumed", "keys-conflict")
-        loaded = {name: _with_pressure(film, bet) for name, film in films.items()}
-        shape = shell_shape(list(loaded.values()))
+        shape = shell_shape(list(films.values()))
     except GateError as fault:
         return films, None, f"shell's shape: frame by frame, within its a priori sd ({fault})"
-    shaped = dict(zip(loaded, with_shape(list(loaded.values()), shape), strict=True))
+    shaped = dict(zip(films, with_shape(list(films.values()), shape), strict=True))
     return shaped, shape, f"shell's shape: {shape.remark}"
-
-
-def _with_pressure(film: FilmFit, bet: Reconstruction) -> LoadedFilm:
-    """Film and dynamic pressure at its frames, NaN outside the trajectory."""
-    air = bet.air
-    at_pa = np.interp(film.time_s, air.time_s, air.dynamic_pressure_pa, left=np.nan, right=np.nan)
-    return LoadedFilm(film, at_pa)
 
 
 def _benchmark(
@@ -304,20 +295,15 @@ def _features(source: str, name: str, film: FilmFit, flight: Flight) -> list[Che
     """Check that a film's benchmark frame shows the features of the vehicle file; none if it states none."""
     if flight.telemetry.required_vehicle().geometry.features in ("none", "texture"):
         return []
-    why, words = (
-        film.oriented.stated_refused,
-        f"{name}: the benchmark frame shows the features that the vehicle file states",
-    )
+    why = film.oriented.stated_refused
+    words = f"{name}: the benchmark frame shows the features that the vehicle file states"
     if why:
         words = (
             f"{name}: {why}; the answers go by edge and texture, and more may be wrong: check outline, mount "
             'and lens of the vehicle file and that the frame is one at rest, or state features = "texture"'
         )
-    return [
-        Check(
-            "camera-features", f"{name}: stated features not found", float(bool(why)), 0.0, 0.0, not why, words, source
-        )
-    ]
+    label = f"{name}: stated features not found"
+    return [Check("camera-features", label, float(bool(why)), 0.0, 0.0, not why, words, source)]
 
 
 def _rests(
@@ -327,11 +313,8 @@ def _rests(
 
     The load is the moment in the joint, or without inertial sensors the dynamic pressure; unknown without a trajectory.
     """
-    if bet is None:
-        load = np.full(len(film.time_s), np.nan)
-    elif bet.loads is None:
-        load = _with_pressure(film, bet).pressure_pa
-    else:
+    load = film.pressure_pa
+    if bet is not None and bet.loads is not None:
         moment_nm = np.linalg.norm(joint_moment(bet.loads).value_nm, axis=1)
         load = np.interp(film.time_s, bet.loads.time_s, moment_nm, left=np.nan, right=np.nan)
     rest = rest_check(history, load, film.benchmark_s, film.oriented.apriori.benchmark_rad, corrected)
@@ -344,11 +327,16 @@ def _smooth(flight: Flight, history: DeflectionHistory) -> DeflectionHistory | N
     """One camera's history as a second-order process; None in an assumed plane, or where too few frames answered."""
     if flight.camera_plane_lv_rad is not None:
         return None
-    swing = joint_swing(flight.telemetry.required_vehicle())
     try:
-        return smoothed(history, swing_hz=None if swing is None else swing.frequency_hz)
+        return smoothed(history, swing_hz=_swing_hz(flight))
     except DivergenceError:
         return None
+
+
+def _swing_hz(flight: Flight) -> float | None:
+    """Natural frequency of the vehicle's joint; None without a spring that bends."""
+    swing = joint_swing(flight.telemetry.required_vehicle())
+    return None if swing is None else swing.frequency_hz
 
 
 def is_oriented(telemetry: Telemetry, frames: Frames) -> bool:

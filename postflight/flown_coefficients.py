@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from estimators.fusing import FusedAnswer
-from estimators.fusion import Fused
+from estimators.evidence import Deflection
+from estimators.fusing import Fused
 from estimators.increments import COEFFICIENTS, STATED, Increments, estimate_increments
 from estimators.loads import FlightLoads
 from flightmodel.aerodynamics import COLUMNS, AeroTable
-from flightmodel.checks import Check, FloatArray, GateError
+from flightmodel.checks import Check, FloatArray
 from flightmodel.files import write_file
 from flightmodel.tabular import Tabular
 from recon.state import MOST_KEPT_SD, data_sheet_check
@@ -43,8 +43,8 @@ class AeroIncrements(Tabular):
     found : Increments
     pulse : FlightLoads
         What they were found from; its vehicle has the preflight table.
-    deflection : Fused
-        Which they were found with.
+    deflection : callable
+        From times to the lateral vectors that they were found with.
     confidence : float
         Of the checks.
     name : str
@@ -53,7 +53,7 @@ class AeroIncrements(Tabular):
 
     found: Increments
     pulse: FlightLoads
-    deflection: Fused
+    deflection: Deflection
     confidence: float
     name: str
 
@@ -78,7 +78,7 @@ class AeroIncrements(Tabular):
         total = np.maximum(weights.sum(axis=0), np.finfo(float).tiny)
         if what == "time":
             return np.asarray(weights.T @ self.pulse.time_s / total)
-        flow = self.pulse.flow_yz_rad - self.deflection.deflection(self.pulse.time_s)
+        flow = self.pulse.flow_yz_rad - self.deflection(self.pulse.time_s)
         return np.asarray(np.sqrt(weights.T @ np.sum(flow**2, axis=1) / total))
 
     def to_frame(self) -> pd.DataFrame:
@@ -200,12 +200,12 @@ class AeroIncrements(Tabular):
         return f"at Mach {peak['mach']:.1f}: {', '.join(shown) or 'none determined'}"
 
 
-def increments_of(answer: FusedAnswer, confidence: float, name: str) -> AeroIncrements:
+def increments_of(answer: Fused, confidence: float, name: str) -> AeroIncrements:
     """Increments from what stands behind a fused deflection.
 
     Parameters
     ----------
-    answer : FusedAnswer
+    answer : Fused
     confidence : float
         Of the checks.
     name : str
@@ -216,10 +216,8 @@ def increments_of(answer: FusedAnswer, confidence: float, name: str) -> AeroIncr
     DivergenceError
         Where they do not settle.
     """
-    if answer.reader is None:
-        raise GateError("aerodynamic increments: the fused answer has no readings", "input-missing")
-    found = estimate_increments(answer.reader, answer)
-    return AeroIncrements(found, answer.reader.pulse, answer, confidence, name)
+    found = estimate_increments(answer.reader, answer.solution)
+    return AeroIncrements(found, answer.reader.pulse, answer.solution.deflection, confidence, name)
 
 
 def write_aero_table(path: Path, table: AeroTable) -> None:

@@ -263,16 +263,8 @@ def _trajectory_rows(first: Reconstruction, second: Reconstruction) -> list[Row]
 
 
 def _deflection_rows(first: Deflections, second: Deflections) -> list[Row]:
-    rows: list[Row] = []
-    for method in dict.fromkeys((*first.histories, *second.histories)):
-        (a, a_sd), (b, b_sd) = (_at_peak(answer, method) for answer in (first, second))
-        rows.append((f"deflection by {method} at peak q", "deg", a, a_sd, b, b_sd))
-    return rows
-
-
-def _at_peak(answer: Deflections, method: str) -> tuple[float, float]:
-    """Deflection and its sd, deg; NaN where the method gave none."""
-    if method not in answer.histories:
-        return float("nan"), float("nan")
-    theta, sd = answer.continuous[method].angle_at(answer.reference_s)
-    return float(np.rad2deg(theta)), float(np.rad2deg(sd))
+    methods = list(dict.fromkeys((*first.histories, *second.histories)))
+    tables = [answer.to_frame().set_index("method").reindex(methods) for answer in (first, second)]
+    columns = [table[name] for table in tables for name in ("theta_deg", "theta_sd_deg")]
+    names = (f"deflection by {method} at peak q" for method in methods)
+    return [(name, "deg", *values) for name, *values in zip(names, *columns, strict=True)]

@@ -253,7 +253,7 @@ def _check(label: str, loads: FlightLoads) -> None:
 def _axial_ratio(loads: FlightLoads) -> FloatArray:
     """Axial force over the one predicted with the vehicle file's axial coefficient (n,)."""
     vehicle = loads.vehicle
-    angle = np.minimum(np.linalg.norm(loads.flow_yz_rad, axis=1), 0.5)
+    angle = np.minimum(loads.alpha_total_wind_rad, 0.5)
     axial = np.array([vehicle.aero.at(m, a)[0] for m, a in zip(loads.mach, angle, strict=True)])
     force = axial * vehicle.reference.area_m2 * loads.dynamic_pressure_pa / vehicle.mass_kg
     return np.asarray(-loads.specific_force_body_mps2[:, 0] / force)

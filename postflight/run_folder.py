@@ -32,12 +32,12 @@ import pandas as pd
 
 from flightmodel import events
 from flightmodel.checks import Check, DivergenceError, FloatArray, GateError, Issue
-from flightmodel.deflection import mean_over
+from flightmodel.deflection import QUANTILE_COLUMNS
 from flightmodel.earth import WGS84, name_of
 from flightmodel.files import PARTIAL, abandoned, open_file, partial_path, write_file, writing
 from flightmodel.tables import column_about
 from flightmodel.telemetry import Telemetry
-from postflight.deflections import Deflections, headline, no_answer_at, quantiles_at
+from postflight.deflections import Deflections, headline
 from postflight.methods import NO_VIDEO
 from postflight.reconstruction import AttitudeCheck, Reconstruction, attitude_table
 from recon.measurements import component_unit
@@ -254,37 +254,28 @@ def _no_nan(value: Any) -> Any:
     return value
 
 
-def method_summary(answers: Deflections, at_s: float) -> dict[str, dict[str, Any]]:
-    """Each method's deflection at one time, and reason and code where it has none."""
+def method_summary(answers: Deflections) -> dict[str, dict[str, Any]]:
+    """Each method's row of `Deflections.to_frame` by the names of ``summary.json``, with the code of its reason."""
     out: dict[str, dict[str, Any]] = {}
     cycle = answers.cycle_s
-    for method, history in answers.histories.items():
-        any_time = answers.continuous[method]
-        theta, sd = np.rad2deg(any_time.angle_at(at_s))
-        largest = history.largest(answers.pulse_s)
-        quantiles = np.rad2deg(quantiles_at(any_time, at_s))
-        out[method] = {
-            "deflection_deg": float(theta),
-            "sd_deg": float(sd),
-            "quantiles_deg": [float(x) for x in quantiles] if np.isfinite(quantiles).all() else None,
-            "largest_deg": float(np.rad2deg(history.theta_rad[largest])),
-            "largest_at_s": float(history.time_s[largest]),
-            "assumptions": history.assumptions,
-        }
-        if cycle is not None:
-            mean, mean_sd = np.rad2deg(mean_over(any_time, cycle))
-            out[method] |= {"mean_deg": float(mean), "mean_sd_deg": float(mean_sd), "mean_over_s": list(cycle)}
-        if not np.isfinite(theta):
-            reason = no_answer_at(any_time, at_s)
-            out[method] |= {"deflection_deg": None, "sd_deg": None, "reason": reason, "code": reason.code}
-    for method, reason in answers.refused.items():
-        out[method] = {
-            "deflection_deg": None,
-            "sd_deg": None,
-            "reason": reason,
-            "code": reason.code,
-            "applicable": reason.code != NO_VIDEO,
-        }
+    for row in answers.to_frame().to_dict(orient="records"):
+        method, answer = row["method"], {"deflection_deg": row["theta_deg"], "sd_deg": row["theta_sd_deg"]}
+        if method in answers.histories:
+            quantiles = [row[name] for name in QUANTILE_COLUMNS]
+            answer |= {
+                "quantiles_deg": quantiles if np.isfinite(quantiles).all() else None,
+                "largest_deg": row["largest_deg"],
+                "largest_at_s": row["largest_t_s"],
+                "assumptions": answers[method].assumptions,
+            }
+            if cycle is not None:
+                answer |= {"mean_deg": row["mean_deg"], "mean_sd_deg": row["mean_sd_deg"], "mean_over_s": list(cycle)}
+        if row["reason"]:
+            code = answers.refused[method].code if method in answers.refused else "no-answer"
+            answer |= {"deflection_deg": None, "sd_deg": None, "reason": row["reason"], "code": code}
+        if method in answers.refused:
+            answer["applicable"] = code != NO_VIDEO
+        out[method] = answer
     return out
 
 
@@ -292,7 +283,7 @@ def best_in_words(answers: Deflections) -> str:
     """Return the headline of the best answer; empty where no method answers at peak q."""
     if answers.best is None:
         return ""
-    row = method_summary(answers, answers.reference_s)[answers.best]
+    row = method_summary(answers)[answers.best]
     return f"{headline(row, at='at peak q' if answers.knows_peak else 'there')} ({answers.best})"
 
 
@@ -426,7 +417,7 @@ def summary(flight: Reconstruction, answers: Deflections, event_rows: pd.DataFra
         "peak_dynamic_pressure_s": float(flight.peak_s),
         "alpha_total_wind_deg": alpha[0] if flight.has_attitude else None,
         "alpha_total_wind_sd_deg": alpha[1] if flight.has_attitude else None,
-        "methods": method_summary(answers, flight.peak_s),
+        "methods": method_summary(answers),
         "agreement": None if answers.fused is None else answers.fused.remark,
         "left_out": None if answers.fused is None else answers.fused.left_out,
         "film_clock": None if answers.fused is None else answers.fused.time_bias_summary(),

@@ -191,9 +191,9 @@ def figure_fusion(flown: Deflections) -> Figure:
         line.text(0.5, 0.5, "no Southwell line", ha="center", transform=line.transAxes)
     else:
         _southwell(line, fused.limbs)
-    names = list(fused.inputs)
-    mean = [fused.inputs[n][0][0] for n in names]
-    left = [np.sqrt(fused.inputs[n][1][0, 0]) for n in names]
+    names = list(fused.solution.inputs)
+    found = fused.solution.inputs.values()
+    mean, left = [value[0] for value, _ in found], [np.sqrt(cov[0, 0]) for _, cov in found]
     inputs.errorbar(mean, range(len(names)), xerr=left, fmt="o", color=COLOUR["fused"], capsize=3)
     inputs.axvspan(-1.0, 1.0, color=COLOUR["prior_band"], lw=0, zorder=0)
     inputs.set_yticks(range(len(names)), names, fontsize=min(8.0, 160.0 / len(names)))
@@ -246,15 +246,18 @@ def figure_correlation(flown: Deflections) -> Figure:
         f"information gain: {better} of {len(singular_values)} parameter directions\n"
         "are better determined than a priori (above the line)"
     )
-    image = table.imshow(fused.correlation, cmap="PuOr", vmin=-1.0, vmax=1.0)
+    names, correlation = (
+        ["deflection y", "deflection z", *fused.solution.inputs],
+        fused.solution.correlation_at(fused.best_s),
+    )
+    image = table.imshow(correlation, cmap="PuOr", vmin=-1.0, vmax=1.0)
     table.grid(visible=False)
-    names = range(len(fused.names))
-    table.set_xticks(names, fused.names, rotation=90, fontsize=7)
-    table.set_yticks(names, fused.names, fontsize=7)
-    size = np.abs(np.triu(fused.correlation, 1))
+    table.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    table.set_yticks(range(len(names)), names, fontsize=7)
+    size = np.abs(np.triu(correlation, 1))
     i, j = np.unravel_index(np.argmax(size), size.shape)
-    most = f"largest: {fused.names[i]} and {fused.names[j]} ({fused.correlation[i, j]:+.2f})"
-    table.set_title(f"correlation given all readings, at {fused.at_s:.1f} s\n{most}")
+    most = f"largest: {names[i]} and {names[j]} ({correlation[i, j]:+.2f})"
+    table.set_title(f"correlation given all readings, at {fused.best_s:.1f} s\n{most}")
     figure.colorbar(image, ax=table, shrink=0.7, label="correlation coefficient")
     note(figure, words_of(flown))
     return figure

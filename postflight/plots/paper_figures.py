@@ -35,7 +35,6 @@ from postflight.plots.overlay import deflection_at, oriented_camera
 from postflight.plots.style import COLOUR, MANY, TIME, band, in_style, legend_above, note, titled
 from postflight.plots.subject import (
     Drawable,
-    Flow,
     bet_of,
     film_of,
     flow_of,
@@ -52,7 +51,7 @@ from postflight.studies.preflight import Bounds, bounds_of, entry_bounds
 _LOOK_UP_END_DEG = 60.0  # of the coefficient tables, where the paper's axis ends too
 
 
-def window(air: AirData | Flow) -> tuple[float, float]:
+def window(air: AirData | FlightLoads) -> tuple[float, float]:
     """Times shown, s: from 80 km or so to well after the pressure pulse."""
     pulse = air.time_s[pressure_pulse(air.dynamic_pressure_pa)]
     width = pulse[-1] - pulse[0]
@@ -60,7 +59,7 @@ def window(air: AirData | Flow) -> tuple[float, float]:
     return float(max(first, air.time_s[0])), float(min(last, air.time_s[-1]))
 
 
-def trajectory_angle(ax: Axes, air: AirData | Flow, label: str) -> None:
+def trajectory_angle(ax: Axes, air: AirData | FlightLoads, label: str) -> None:
     """Draw the trajectory's total angle of attack with its standard deviation."""
     alpha, sd = np.rad2deg(air.alpha_total_wind_rad), np.rad2deg(air.alpha_total_wind_sd_rad)
     ax.plot(air.time_s, alpha, color=COLOUR["estimate"], lw=1.4, label=label)
@@ -68,7 +67,7 @@ def trajectory_angle(ax: Axes, air: AirData | Flow, label: str) -> None:
 
 
 def fit_height(
-    ax: Axes, air: AirData | Flow, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
+    ax: Axes, air: AirData | FlightLoads, most: float = 180.0, of: tuple[str, ...] = ("",), room: float = 1.15
 ) -> None:
     """Fit the top of an angle axis, deg, to the visible part of lines whose labels start with ``of``."""
     first, last = window(air)
@@ -289,7 +288,7 @@ def _look_up(ax: Axes, time_s: FloatArray, use: BoolArray, angle_rad: FloatArray
     ax.plot(time_s, np.where(use, np.rad2deg(angle_rad), np.nan), color=colour, label=label)
 
 
-def _angles(ax: Axes, air: AirData | Flow) -> None:
+def _angles(ax: Axes, air: AirData | FlightLoads) -> None:
     ax.set(xlim=window(air), ylabel="total angle of attack (deg)", xlabel=time_label(air))
     fit_height(ax, air, most=_LOOK_UP_END_DEG)
     legend_above(ax, 1)

@@ -5,14 +5,10 @@ Each figure asks here for the part that it draws. What has no such part is refus
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-
-from estimators.fusing import FusedAnswer
-from estimators.loads import FlightLoads, lateral_and_size
+from estimators.fusing import Fused
+from estimators.loads import FlightLoads
 from flightmodel.airdata import AirData
-from flightmodel.checks import FloatArray, GateError
+from flightmodel.checks import GateError
 from flightmodel.deflection import DeflectionHistory
 from flightmodel.telemetry import Telemetry
 from postflight.deflections import Deflections
@@ -25,15 +21,6 @@ from postflight.runs import Run
 
 Drawable = Reconstruction | Run | FlightLoads | Deflections
 RUN, FUSE, LOADS = "pf.read_run(folder)", "pf.fuse(bet)", "pf.read_loads(table, vehicle)"
-
-
-class Flow(NamedTuple):
-    """Air data of a table of loads, by the names that `AirData` has: times s, angles rad, pressure Pa, each (n,)."""
-
-    time_s: FloatArray
-    alpha_total_wind_rad: FloatArray
-    alpha_total_wind_sd_rad: FloatArray
-    dynamic_pressure_pa: FloatArray
 
 
 def lacking(figure: str, given: object, part: str, *wanted: str) -> GateError:
@@ -74,15 +61,10 @@ def loads_of(figure: str, given: object) -> FlightLoads:
     raise lacking(figure, given, "loads", RECONSTRUCT, RUN, LOADS)
 
 
-def flow_of(figure: str, given: object) -> AirData | Flow:
-    """Air data along the trajectory, or of loads; `GateError` where there are none."""
+def flow_of(figure: str, given: object) -> AirData | FlightLoads:
+    """Air data along the trajectory, or the loads, which name the flow alike; `GateError` where there are none."""
     source = source_of(given)
-    if isinstance(source, Reconstruction | Run):
-        return source.air
-    loads = loads_of(figure, given)
-    towards, size = lateral_and_size(loads.flow_yz_rad)
-    sd = np.sqrt(np.einsum("ni,nij,nj->n", towards, loads.flow_cov, towards))
-    return Flow(loads.time_s, size, sd, loads.dynamic_pressure_pa)
+    return source.air if isinstance(source, Reconstruction | Run) else loads_of(figure, given)
 
 
 def answers_of(figure: str, given: object) -> Deflections:
@@ -102,7 +84,7 @@ def history_of(figure: str, given: object, method: str) -> DeflectionHistory:
         raise GateError(f"{figure}: {fault.args[0]}", "input-missing") from None
 
 
-def fused_of(figure: str, given: object) -> FusedAnswer:
+def fused_of(figure: str, given: object) -> Fused:
     """Posterior behind the fused answer; `GateError` where there is none."""
     answers = given if isinstance(given, Deflections) else Deflections()
     if answers.fused is None:

@@ -145,7 +145,7 @@ def _as_run(answers: Deflections, flight: Flight, folder: Path, settings: dict[s
     tables["events"] = pd.DataFrame({"t_s": [], "event": []})
     tables["findings"] = pd.DataFrame([f.as_row() for f in telemetry.findings], columns=["source", "what", "code"])
     summary: dict[str, Any] = {
-        "methods": method_summary(answers, at_s),
+        "methods": method_summary(answers),
         "agreement": None if answers.fused is None else answers.fused.remark,
         "peak_dynamic_pressure_s": at_s,
         "verdicts_passed": sum(check.passed for check in checks),

@@ -74,14 +74,15 @@ def test_inputs_with_the_deflection_integrated_over_are_those_of_the_whole_probl
     covariance = np.linalg.inv(matrix)
     mean = covariance @ normal.right
     found = normal.solved(FREE_RADPS2, "whole")
-    np.testing.assert_allclose(found.of_inputs, mean[size:], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(found.inputs, covariance[size:, size:], rtol=1e-6)
+    inputs = found.input_posterior
+    np.testing.assert_allclose(inputs.mean, mean[size:], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(inputs.covariance, covariance[size:, size:], rtol=1e-6)
     whole = normal.spline.rows(TIME_S) @ mean[:size].reshape(-1, 2)
     np.testing.assert_allclose(found.deflection(TIME_S), whole, atol=1e-9)
-    np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance)), rtol=1e-5)
+    np.testing.assert_allclose(found.sd, np.sqrt(np.diag(covariance))[:size], rtol=1e-5)
     value = normal.spline.rows(TIME_S[::7]).toarray()
     lateral = value @ covariance[:size:2, 1:size:2] @ value.T
-    got = found.lateral_cov(normal.spline.rows(TIME_S[::7]))
+    got = found.lateral_cov(TIME_S[::7])
     np.testing.assert_allclose(got[:, 0, 1], np.diag(lateral), rtol=1e-4, atol=1e-14)
 
 
@@ -121,7 +122,7 @@ def slope(k, size):
 
 def found_of(loads):
     reader = loads_reader(loads, METHODS, [])
-    found = estimate_increments(reader, fuse(reader))
+    found = estimate_increments(reader, fuse(reader)[1])
     return found, np.sqrt(np.diag(found.covariance)).reshape(4, -1)
 
 

@@ -230,7 +230,7 @@ def test_of_many_swings_that_fit_alike_the_clock_s_own_term_chooses():
     late = 0.05
     own = told("misalignment", t, ringing(t), 2e-4, 0.0)
     film = told("camera", frames, ringing(frames - late), 1e-3, 0.2)
-    found = fuse(lambda inputs, about: [own, moved_evidence(film, inputs, about)])
+    _, found = fuse(lambda inputs, about: [own, moved_evidence(film, inputs, about)])
     mean, covariance = found.inputs[CAMERA_TIME_BIAS]
     assert 0.2 * mean[0] == pytest.approx(late, abs=0.005)
     assert 0.2 * np.sqrt(covariance[0, 0]) < 0.005

@@ -13,7 +13,7 @@ from estimators.edge import no_horizon
 from estimators.evidence import CONSTANT_PART, LIGHT_TIME_S
 from estimators.frame_residuals import FrameShape
 from estimators.frame_solution import AprioriSd, FrameFit
-from estimators.shell_shape import HYPOTHESES, LOBES, MODES, LoadedFilm, mode_sd_rad, shell_shape, with_shape
+from estimators.shell_shape import HYPOTHESES, LOBES, MODES, load_shares, mode_sd_rad, shell_shape, with_shape
 from flightmodel.checks import NO_FAULT, GateError
 from flightmodel.statistics import correlation
 from synthetic_flight.film import Imaging, Scene, Warp
@@ -79,8 +79,7 @@ def drawn(rng, there, formal_deg=0.02):
         )
         for k in range(n)
     )  # fmt: skip
-    film = FilmFit(TIME_S, fits, oriented, float(TIME_S[0]), None, 0.0)
-    return LoadedFilm(film, PRESSURE_PA), true, amplitude
+    return FilmFit(TIME_S, fits, oriented, float(TIME_S[0]), None, 0.0, PRESSURE_PA), true, amplitude
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +119,7 @@ def test_a_film_that_knows_its_shell_reads_the_deflection_better_and_says_so(man
     errors, before, square = [], [], []
     for *_, true, film, better in many:
         k = int(np.argmax(PRESSURE_PA))
-        fit, first = better.fits[k], film.film.fits[k]
+        fit, first = better.fits[k], film.fits[k]
         errors.append(fit.rotation_yz_rad - true[k, :2])
         before.append(first.rotation_yz_rad - true[k, :2])
         square.append(errors[-1] @ np.linalg.solve(fit.covariance, errors[-1]))
@@ -135,12 +134,12 @@ def test_a_camera_whose_error_grows_with_the_load_tells_less_of_the_shape():
     alike[2:] = np.eye(len(MODES))[:, :12] * D(0.2)
     fits = tuple(
         replace(fit, shape=replace(fit.shape, by_camera=share * alike))
-        for fit, share in zip(film.film.fits, load, strict=True)
+        for fit, share in zip(film.fits, load, strict=True)
     )
     of_pose = []
     for sd in (0.01, 1.0):
         oriented = SimpleNamespace(apriori=AprioriSd(), posed_covariance=sd**2 * np.eye(12))
-        shape = shell_shape([replace(film, film=replace(film.film, fits=fits, oriented=oriented))])
+        shape = shell_shape([replace(film, fits=fits, oriented=oriented)])
         of_pose.append(np.sqrt(np.diag(shape.covariance)))
     assert (of_pose[1][:12] > 1.5 * of_pose[0][:12]).any()
 
@@ -174,10 +173,10 @@ def test_the_table_has_a_row_a_mode_in_degrees(many):
 def test_frames_of_one_load_tell_nothing():
     film, _, _ = drawn(np.random.default_rng(1), ())
     with pytest.raises(GateError) as refusal:
-        shell_shape([LoadedFilm(film.film, np.full(len(TIME_S), 1000.0))])
+        shell_shape([replace(film, pressure_pa=np.full(len(TIME_S), 1000.0))])
     assert refusal.value.codes == ("loads-alike",)
     with pytest.raises(GateError) as refusal:
-        shell_shape([LoadedFilm(film.film, np.where(np.arange(len(TIME_S)) < 5, PRESSURE_PA, np.nan))])
+        shell_shape([replace(film, pressure_pa=np.where(np.arange(len(TIME_S)) < 5, PRESSURE_PA, np.nan))])
     assert refusal.value.codes == ("too-few-data",)
 
 
@@ -188,7 +187,7 @@ def test_the_film_s_shape_takes_the_place_of_the_frame_s_prior():
     shape = replace(shell_shape(films), frame_sd_rad=float(D(0.1)), points_scale=2.0)
     k, m = int(np.argmax(PRESSURE_PA)), len(MODES)
     for number, film in enumerate(films):
-        own, load = film.film.fits[k].shape, film.shares(shape.largest_pa)[k]
+        own, load = film.fits[k].shape, load_shares(film, shape.largest_pa)[k]
         alike = np.exp(-(TIME_S[k] - TIME_S[0]) / LIGHT_TIME_S)
         points = np.linalg.inv(own.formal)
         seen = points @ own.found_rad / 4.0
@@ -208,8 +207,8 @@ def test_a_motion_of_the_picture_stays_in_the_variance():
     """The film's shape explains lobes, not a lens that zoomed."""
     one, k = drawn(np.random.default_rng(5), ("two waves",))[0], int(np.argmax(PRESSURE_PA))
     shape = shell_shape([one])
-    fits = tuple(replace(fit, moved_var=D(0.3) ** 2) if j == k else fit for j, fit in enumerate(one.film.fits))
-    moved = replace(one, film=replace(one.film, fits=fits))
+    fits = tuple(replace(fit, moved_var=D(0.3) ** 2) if j == k else fit for j, fit in enumerate(one.fits))
+    moved = replace(one, fits=fits)
     sound, wider = (with_shape([film], shape)[0].fits[k].covariance for film in (one, moved))
     np.testing.assert_allclose(wider, sound + D(0.3) ** 2 * np.eye(2), rtol=1e-9)
 
@@ -217,8 +216,8 @@ def test_a_motion_of_the_picture_stays_in_the_variance():
 def test_a_film_without_answers_leaves_the_others_theirs():
     rng = np.random.default_rng(6)
     film, dark = (drawn(rng, ())[0] for _ in range(2))
-    refused = tuple(replace(fit, shape=None) for fit in dark.film.fits)
-    none = LoadedFilm(replace(dark.film, fits=refused), PRESSURE_PA)
+    refused = tuple(replace(fit, shape=None) for fit in dark.fits)
+    none = replace(dark, fits=refused)
     both, alone = shell_shape([film, none]), shell_shape([film])
     np.testing.assert_allclose(both.amplitude_rad, alone.amplitude_rad, rtol=1e-6, atol=1e-12)
     assert with_shape([film, none], both)[1].fits == refused

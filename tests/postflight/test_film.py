@@ -186,7 +186,7 @@ def test_a_film_that_contradicts_what_is_stated_turns_a_check_red(flight, painte
     for k, picture in enumerate(rendered(4, [0.0, 3.0, 3.0], [0.0, 170.0, 180.0], Imaging(painted=painted))):
         cv2.imwrite(str(flight.root / f"telemetry/camera5/frame_{k}.png"), picture)
     flown = read_flown(flight.root, needs_path=False).with_(camera_plane_lv_deg=plane_deg)
-    checks = {check.code: check for check in camera_answer(flown, None).consistency_checks}
+    checks = {check.code: check for check in camera_answer(flown).consistency_checks}
     assert {"camera-features"} | ({"camera-plane"} if plane_deg else set()) <= set(checks)
     assert {code for code, check in checks.items() if not check.passed} == red
     assert {check.source for check in checks.values() if not check.passed} <= {"camera"}

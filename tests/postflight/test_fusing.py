@@ -214,7 +214,7 @@ def test_a_mixture_of_histories_whose_planes_are_all_lost_is_as_well_known_acros
         name: DeflectionHistory(times, np.full(len(times), np.deg2rad(size)), np.zeros(len(times)), unknown, name, "")
         for name, size in (("one", 0.1), ("other", 0.5))
     }
-    mixed = _mixed(answer, lost, np.ones(2), sound()).history
+    mixed = _mixed(answer, lost, np.ones(2)).history
     # same planes: 0.3 deg of each, and their sizes 0.2 deg on either side of the mean
     expected = np.deg2rad([[np.hypot(0.3, 0.2), 0.0], [0.0, 0.3]]) ** 2
     np.testing.assert_allclose(mixed.theta_rad, np.deg2rad(0.3))
