@@ -54,15 +54,6 @@ class Arrow:
     across: FloatArray
     corner: FloatArray
 
-    @classmethod
-    def of_blocks(cls, own: FloatArray, below: FloatArray, across: FloatArray, corner: FloatArray) -> Arrow:
-        """Arrow of blocks on the diagonal (k, b, b) and below it (k - 1, b, b), and of the border."""
-        count, size, _ = own.shape
-        band, (row, column) = np.zeros((2 * size, count, size)), _of_block_column(size)
-        blocks = np.concatenate([own, np.concatenate([below, np.zeros((1, size, size))])], axis=1)
-        band[row - column, :, column] = blocks[:, row, column].T
-        return cls(band.reshape(2 * size, -1), across, corner)
-
     def columns(self, at: IntArray) -> FloatArray:
         """Columns (n + m, k) of the border, by their numbers in it (k,)."""
         return np.concatenate([self.across[:, at], self.corner[:, at]])

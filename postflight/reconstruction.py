@@ -115,7 +115,6 @@ _FORCE_NAMES = (
 # of the angular acceleration this half window leaves out 0.5 % at 1 Hz and 3 % at 2.5 Hz; so does a shorter one of a
 # vehicle that pitches and spins faster. At least some samples must lie in it
 _HALF_WINDOW_S, _MOST_TURN_RAD, _LEAST_SAMPLES = 0.02, 0.31, 2.5
-_RATE_HZ = 5.0  # of the history: a second's work for four minutes of flight, as good as 10 Hz (docs/attitude.md)
 _CODE = "trajectory-diverged"
 _DIVERGED = (
     "Check planet, [start.state] and its time, the accelerometer's and gyros' units, signs and mounting, and the "
@@ -669,7 +668,7 @@ def check_attitude(telemetry: Telemetry, bet: TrajectorySolution) -> AttitudeChe
         ends = np.clip(bet.smoothed.time_s[[0, -1]], t[0], t[-1])
         at = np.union1d(t[(t > ends[0]) & (t < ends[1])], ends)
         place = at, interpolate_rows(at, t, points)
-        history = reconstruct_attitude(telemetry, place, _RATE_HZ, settings.check_confidence)
+        history = reconstruct_attitude(telemetry, place, settings.check_confidence)
         comparison = compare_attitudes(history, bet.smoothed, settings.check_confidence)
         found += history.findings
     except GateError as fault:

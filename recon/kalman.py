@@ -68,6 +68,7 @@ from flightmodel import rotations
 from flightmodel._kernels import inlined, kernel, multiply, small_cholesky, small_solve
 from flightmodel.checks import BoolArray, DivergenceError, FloatArray, IntArray
 from recon.linearise import (
+    Linearised,
     Readings,
     Steps,
     flight_of,
@@ -147,19 +148,31 @@ class ForwardPass:
 
 def forward(problem: Problem, reference: States | None = None, engine: str = COMPILED) -> ForwardPass:
     """Run the filter through all nodes, about its own estimate or about a reference trajectory."""
+    if reference is not None:
+        return filtered(problem, linearise(problem, reference), boxminus(problem.start, reference[0]), engine)
     n, flight, use = len(problem.time_s), flight_of(problem), ENGINES[engine]
     *_, sources, observed, wander = flight
-    given = observed, sources.slot, wander, problem.gate
     run, innovations = empty_answer(problem)
-    run.p_last[:] = problem.start_covariance
-    if reference is not None:
-        line, x = linearise(problem, reference), boxminus(problem.start, reference[0])
-        use(*given, 0, n, x, line.steps, line.readings, run, innovations)
-    else:
-        line, x = unfilled(problem), np.zeros(problem.size)
-        for k in range(n):
-            linearise_nodes(*flight, k, k + 1, x, False, *line)
-            use(*given, k, k + 1, x, line.steps, line.readings, run, innovations)
+    line, x = unfilled(problem), np.zeros(problem.size)
+    for k in range(n):
+        linearise_nodes(*flight, k, k + 1, x, False, *line)
+        use(observed, sources.slot, wander, problem.gate, k, k + 1, x, line.steps, line.readings, run, innovations)
+    return forward_pass(line, run, innovations)
+
+
+def filtered(problem: Problem, line: Linearised, x: FloatArray, engine: str = COMPILED) -> ForwardPass:
+    """Run the filter through the nodes of a flight made linear, from the error ``x`` (N,) about its first chart."""
+    *_, sources, observed, wander = flight_of(problem)
+    run, innovations = empty_answer(problem)
+    ENGINES[engine](
+        observed, sources.slot, wander, problem.gate, 0, len(problem.time_s), x, line.steps, line.readings, run,
+        innovations,
+    )  # fmt: skip
+    return forward_pass(line, run, innovations)
+
+
+def forward_pass(line: Linearised, run: Filtered, innovations: Innovations) -> ForwardPass:
+    """What was filtered, with charts that do not change the sign of a quaternion."""
     charts = States(*line.charts)
     charts = replace(charts, q_ecef_body=rotations.continuous(charts.q_ecef_body))
     return ForwardPass(charts, line.steps, line.readings, run, innovations)
@@ -181,7 +194,7 @@ def log_likelihood(problem: Problem, run: ForwardPass) -> tuple[float, float]:
 
 
 def empty_answer(problem: Problem) -> tuple[Filtered, Innovations]:
-    """Arrays for one pass."""
+    """Arrays for one pass, of which the covariance is the start's."""
     n, size, dense, count = len(problem.time_s), problem.size, problem.dense, len(problem.row)
     kept: IntArray = np.full(n, -1, dtype=np.int64)
     kept[problem.kept] = np.arange(int(problem.kept.sum()))
@@ -189,6 +202,7 @@ def empty_answer(problem: Problem) -> tuple[Filtered, Innovations]:
         (n, size), (n, size), (n, size * (size + 1) // 2), (int(problem.kept.sum()), dense * (dense + 1) // 2),
         (size, size),
     )  # fmt: skip
+    p_last[:] = problem.start_covariance
     return Filtered(x_minus, x_plus, p_minus, kept, p_plus, p_last), Innovations(
         np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.zeros(count, dtype=bool),
         np.zeros((count, size, 3)),

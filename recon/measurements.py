@@ -23,8 +23,12 @@ and noise:
   against the air, so that body x reads ``-a``: off by an angle ``e`` the axial reading differs by about ``e^2``
   (``C_A = C_D cos e - C_L sin e`` with a lift of ``-e`` of the drag, as a blunt body has), which widens ``s``;
 * at rest (`recon.rest`): zero velocity; of the gyros as of a magnetometer, with the Earth's rate for ``B``;
-* magnetometer: ``S R(m)^T D^T C^T B + b``, S with scales and soft iron, m the mounting rotation, D its nominal axes;
-* Sun head: azimuth and elevation of ``R(m)^T D^T C^T s``.
+* magnetometer: ``S R(m)^T D^T C^T (B + f) + b``, S with scales and soft iron, m the mounting rotation, D its nominal
+  axes, f the error of the field;
+* Sun head: azimuth and elevation of ``R(m)^T D^T C^T (s - e u)`` with ``u`` up and ``e`` the weight of the Earth's
+  light, of which a part is for heads that have the nadir in their field alone; a head whose tag is late by ``tau``
+  reads what was, by the body's rate. No data sheet states ``f``, ``e`` and ``tau``; `recon.vector_attitude` estimates
+  them.
 
 A tracker's angle noise is noise of its line of sight: ``angle_sd`` in elevation and in traverse, hence
 ``angle_sd / cos(elevation)`` in azimuth. `Settings.angle_noise` is ``"axis"`` for a radar whose azimuth readings
@@ -63,7 +67,7 @@ from flightmodel.tables import spacing_s
 from flightmodel.telemetry import BarometerRecord, GnssRecord, RadarRecord, SunRecord, TriadRecord
 from recon.imu_screening import frozen_rows
 from recon.propagation import ballistic_acceleration, cross_into, level, matmul_into, mount_matrices
-from recon.state import DRIVERS, ErrorModel, States, right_jacobian
+from recon.state import DRIVERS, ErrorModel, States
 
 RADAR, POSITION, VELOCITY, HEIGHT, FIELD, SUN, RANGE_RATE, DECELERATION = range(8)
 REST = "rest"  # zero velocities on the pad
@@ -88,22 +92,25 @@ _OWN_RADAR, _DOPPLER, _LAST = _STATES[:_RANGE_RATE_AT], _STATES[_RANGE_RATE_AT:-
     TRAVERSE_WANDER, ELEVATION_WANDER, REFRACTION, RANGE_SCALE, SURVEY, _, _, NORTH, SITES_SURVEY, _, _, SITES_NORTH,
     RANGE_WANDER, SERVO_LAG,
 ) = range(len(_OWN_RADAR) + len(instruments.SITES.states) + len(_LAST))  # fmt: skip
+# of a magnetometer the field's error; of a Sun head the Earth's light where it has the nadir in its field, and anywhere
+FIELD_ERROR, EARTHLIGHT, EVERYWHERE = 12, 2, 7
 # errors that the velocity of a point beside the accelerometer depends on
 _GYROS = (*instruments.RATES.states[:9], "time bias")
-# time biases stand in a radar's slot, and the directions of Sun heads where the compiled kernels look for them
+# time biases stand in a radar's slot
 SLOT_NAMES: dict[int, tuple[str, ...]] = {
     RADAR: (*_OWN_RADAR, *instruments.SITES.states, *_LAST),
     RANGE_RATE: (*_DOPPLER, "", _STATES[3], *_GYROS),
     POSITION: instruments.GNSS.states[:4],
     VELOCITY: (*instruments.GNSS.states[4:], instruments.GNSS.states[3], *_GYROS),
     HEIGHT: instruments.BAROMETER.states,
-    FIELD: instruments.MAGNETOMETER.states,
-    SUN: (*instruments.SUN.states[:2], "", "", *instruments.SUN.states[2:]),
+    FIELD: (*instruments.MAGNETOMETER.states, "field x", "field y", "field z"),
+    SUN: (*instruments.SUN.states[:2], "earthlight", "time bias", *instruments.SUN.states[2:], "earthlight everywhere"),
     DECELERATION: ("bias", "scale", "", "time bias", *(name for _, name in DRIVERS)),
 }
 SLOTS = max(map(len, SLOT_NAMES.values()))
 _OWNERS = {DECELERATION: dict(enumerate((owner for owner, _ in DRIVERS), start=4))}  # of slots that are not its own
 _OWNERS |= dict.fromkeys((VELOCITY, RANGE_RATE), dict.fromkeys(range(4, 14), "rates"))
+_OWNERS[SUN] = dict.fromkeys((EARTHLIGHT, TIME_BIAS, EVERYWHERE), "sun")  # of all heads
 
 
 def component_unit(component: str) -> str:
@@ -130,7 +137,8 @@ class Instrument:
     arm_body_m : (3,) float
         Tracked point from the accelerometer, body axes.
     site_ecef_m : (3,) float
-        Radar, or reference of a receiver; of a barometer, the height above which its scale acts, first.
+        Radar, or reference of a receiver; of a barometer, the height above which its scale acts, first; of a Sun head,
+        the cosine of half its field, first.
     dcm : (3, 3) float
         ``dcm_ned_ecef`` at the site, or ``dcm_body_sensor``.
     time_s : (k,) float
@@ -366,10 +374,8 @@ def sun_instruments(name: str, record: SunRecord, sun_ecef: FloatArray, rows: In
         sd = np.full((len(rows), 3), record.spec.noise_sd_rad)
         sd[:, 0] /= np.maximum(np.cos(np.where(np.isfinite(angles[:, 1]), angles[:, 1], 0.0)), 1e-3)
         value = np.column_stack([angles, np.full(len(rows), np.nan)])
-        head = f"{name}{number}"
-        out.append(
-            instrument_of(head, SUN, head, np.zeros(3), np.zeros(3), dcm, record.time_s[rows], value, sd, sun_ecef)
-        )
+        head, edge = f"{name}{number}", np.array([np.cos(0.5 * record.spec.field_rad), 0.0, 0.0])
+        out.append(instrument_of(head, SUN, head, np.zeros(3), edge, dcm, record.time_s[rows], value, sd, sun_ecef))
     return [i for i in out if len(i.time_s)]
 
 
@@ -707,60 +713,48 @@ def partials_by_rotations(by_axes, i, mount, body, actual, e, offset, by_state, 
 
 
 @inlined
+def partials_by_known(by_axes, mount, c, out):
+    """Partials (3,) by a direction in Earth-fixed axes, of those by the direction in the sensor's axes, (3,)."""
+    for k in range(3):
+        out[k] = 0.0
+        for j in range(3):
+            out[k] += (by_axes[0] * mount[j, 0] + by_axes[1] * mount[j, 1] + by_axes[2] * mount[j, 2]) * c[k, j]
+
+
+@inlined
 def predict_field(dcm_body_sensor, known, e, c, h, by_state, by_error):
-    """Field in a magnetometer's axes: ``S (R(mount)^T D^T C^T B) + bias``, S with scales and soft iron."""
-    mount, body, actual = np.empty((3, 3)), np.empty(3), np.empty(3)
-    in_mounted_axes(dcm_body_sensor, known, e, 6, c, mount, body, actual)
+    """Field in a magnetometer's axes: ``S (R(mount)^T D^T C^T (B + f)) + bias``, S with scales and soft iron."""
+    mount, body, actual, field, row = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        field[i] = known[i] + e[FIELD_ERROR + i]
+    in_mounted_axes(dcm_body_sensor, field, e, 6, c, mount, body, actual)
     iron = ((1.0 + e[3], e[9], e[10]), (e[9], 1.0 + e[4], e[11]), (e[10], e[11], 1.0 + e[5]))
     for i in range(3):
         h[i] = e[i] + iron[i][0] * actual[0] + iron[i][1] * actual[1] + iron[i][2] * actual[2]
         by_error[i, i], by_error[i, 3 + i] = 1.0, actual[i]
         partials_by_rotations(iron[i], i, mount, body, actual, e, 6, by_state, by_error)
+        partials_by_known(iron[i], mount, c, row)
+        for j in range(3):
+            by_error[i, FIELD_ERROR + j] = row[j]
     by_error[0, 9], by_error[1, 9] = actual[1], actual[0]
     by_error[0, 10], by_error[2, 10] = actual[2], actual[0]
     by_error[1, 11], by_error[2, 11] = actual[2], actual[1]
 
 
-def magnetometer_model(
-    dcm_body_sensor: FloatArray, body: FloatArray, e: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Magnetometer reading (..., 3) of a field ``body`` (..., 3) in body axes, with its partials.
-
-    Parameters
-    ----------
-    dcm_body_sensor : (3, 3) float
-        Nominal mounting.
-    body : (..., 3) float
-    e : (..., SLOTS) float
-        Errors in the order of `SLOT_NAMES`; mount alone must be the same for all.
-
-    Returns
-    -------
-    h : (..., 3) float
-    by_body : (..., 3, 3) float
-        Partials by the field in body axes; those by a rotation of the body are ``by_body @ skew(body)``.
-    by_error : (..., 3, SLOTS) float
-    """
-    mount = e.reshape(-1, SLOTS)[0, 6:9]
-    to_sensor = (dcm_body_sensor @ rotations.dcm_from_q(rotations.exp(mount))).T
-    x = body @ to_sensor.T
-    iron = np.zeros((*x.shape, 3))
-    by_error = np.zeros((*x.shape, SLOTS))
-    for i in range(3):
-        iron[..., i, i] = 1.0 + e[..., 3 + i]
-        by_error[..., i, i], by_error[..., i, 3 + i] = 1.0, x[..., i]
-    for slot, (i, j) in zip((9, 10, 11), ((0, 1), (0, 2), (1, 2)), strict=True):
-        iron[..., i, j] = iron[..., j, i] = e[..., slot]
-        by_error[..., i, slot], by_error[..., j, slot] = x[..., j], x[..., i]
-    by_error[..., 6:9] = iron @ rotations.skew(x) @ right_jacobian(mount)
-    return (iron @ x[..., None])[..., 0] + e[..., 0:3], iron @ to_sensor, by_error
-
-
 @inlined
-def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
-    """Azimuth and elevation of the Sun in a head's axes; errors: biases normal to the line of sight, mount."""
-    mount, body, s = np.empty((3, 3)), np.empty(3), np.empty(3)
-    in_mounted_axes(dcm_body_head, known, e, 4, c, mount, body, s)
+def predict_sun(edge, dcm_body_head, known, e, position, c, rate, h, by_state, by_error):
+    """Azimuth and elevation of the Sun in a head's axes; ``edge`` is the cosine of half its field."""
+    mount, body, s, light, row = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    radius = math.sqrt(position[0] * position[0] + position[1] * position[1] + position[2] * position[2])
+    seen = 0.0  # of the nadir, along the head's axis
+    for i in range(3):
+        light[i] = -position[i] / radius
+        for j in range(3):
+            seen += light[i] * c[i, j] * dcm_body_head[j, 2]
+    share = 1.0 if seen > edge else 0.0
+    for i in range(3):
+        s[i] = known[i] + (e[EVERYWHERE] + share * e[EARTHLIGHT]) * light[i]
+    in_mounted_axes(dcm_body_head, s, e, 4, c, mount, body, s)
     normal2 = s[1] * s[1] + s[2] * s[2] + 1e-30
     normal = math.sqrt(normal2)
     whole2 = normal2 + s[0] * s[0]
@@ -774,28 +768,12 @@ def predict_sun(dcm_body_head, known, e, c, h, by_state, by_error):
     by_error[0, 0], by_error[1, 1] = 1.0 / normal, 1.0
     for i in range(2):
         partials_by_rotations(p[i], i, mount, body, s, e, 4, by_state, by_error)
-
-
-def sun_model(dcm_body_head: FloatArray, body: FloatArray, e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Azimuth and elevation (..., 2) of the Sun in a head, from its direction ``body`` (..., 3); as the magnetometer's.
-
-    Partials ``by_body`` (..., 2, 3) and ``by_error`` (..., 2, SLOTS); the errors are one for all.
-    """
-    e = e.reshape(-1, SLOTS)[0]
-    to_head = (dcm_body_head @ rotations.dcm_from_q(rotations.exp(e[4:7]))).T
-    s = body @ to_head.T
-    x, y, z = np.moveaxis(s, -1, 0)
-    normal = np.hypot(y, z)
-    whole2 = normal**2 + x**2
-    p = np.zeros((*body.shape[:-1], 2, 3))
-    p[..., 0, 1] = z / normal**2 - e[0] * y / normal**3
-    p[..., 0, 2] = -y / normal**2 - e[0] * z / normal**3
-    p[..., 1, 0], p[..., 1, 1], p[..., 1, 2] = normal / whole2, -x * y / (whole2 * normal), -x * z / (whole2 * normal)
-    by_error = np.zeros((*body.shape[:-1], 2, SLOTS))
-    by_error[..., 4:7] = p @ rotations.skew(s) @ right_jacobian(e[4:7])
-    by_error[..., 0, 0], by_error[..., 1, 1] = 1.0 / normal, 1.0
-    h = np.stack([np.arctan2(y, z) + e[0] / normal, np.arctan2(x, normal) + e[1]], axis=-1)
-    return h, p @ to_head, by_error
+        partials_by_known(p[i], mount, c, row)
+        for j in range(3):
+            by_error[i, EVERYWHERE] += row[j] * light[j]
+            by_error[i, TIME_BIAS] -= by_state[i, 6 + j] * rate[0, j]
+        by_error[i, EARTHLIGHT] = share * by_error[i, EVERYWHERE]
+        h[i] += e[TIME_BIAS] * by_error[i, TIME_BIAS]
 
 
 @inlined
@@ -811,7 +789,7 @@ def predict(kind, arm, site, dcm, known, e, position, velocity, c, rate, acceler
         predict_field(dcm, known, e, c, h, by_state, by_error)
         return
     if kind == SUN:
-        predict_sun(dcm, known, e, c, h, by_state, by_error)
+        predict_sun(site[0], dcm, known, e, position, c, rate, h, by_state, by_error)
         return
     point, speed, effective, m = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
     tau, sweep, pulled = e[TIME_BIAS], np.empty(3), np.empty(3)

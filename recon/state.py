@@ -105,12 +105,6 @@ def boxminus(states: States, reference: States) -> FloatArray:
     )
 
 
-def right_jacobian(rotation_rad: FloatArray) -> FloatArray:
-    """Matrix (3, 3) from a change of a rotation vector to the body-axis rotation it causes; second order."""
-    k = rotations.skew(rotation_rad)
-    return np.eye(3) - 0.5 * k + k @ k / 6.0
-
-
 class Wander(NamedTuple):
     """Gauss-Markov model of each error (m,).
 

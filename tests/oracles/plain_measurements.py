@@ -14,10 +14,8 @@ from recon.measurements import (
     SLOTS,
     SUN,
     VELOCITY,
-    magnetometer_model,
     sight,
     sight_partials,
-    sun_model,
 )
 
 
@@ -37,14 +35,60 @@ class NodeMotion:
     planet: Planet = WGS84
 
 
+def right_jacobian(rotation_rad):
+    """Matrix (3, 3) from a change of a rotation vector to the body-axis rotation it causes; second order."""
+    k = rotations.skew(rotation_rad)
+    return np.eye(3) - 0.5 * k + k @ k / 6.0
+
+
+def _magnetometer(instrument, known, e, at):
+    """Reading (3,) of a magnetometer, its partials by the field in body axes, that field, and partials by errors."""
+    by_error, to_body = np.zeros((3, SLOTS)), at.dcm_ecef_body.T
+    to_sensor = (instrument.dcm @ rotations.dcm_from_q(rotations.exp(e[6:9]))).T
+    body = to_body @ (known + e[12:15])
+    x = to_sensor @ body
+    iron = np.diag(1.0 + e[3:6])
+    by_error[:, 0:3], by_error[:, 3:6] = np.eye(3), np.diag(x)
+    for slot, (i, j) in zip((9, 10, 11), ((0, 1), (0, 2), (1, 2)), strict=True):
+        iron[i, j] = iron[j, i] = e[slot]
+        by_error[i, slot], by_error[j, slot] = x[j], x[i]
+    by_error[:, 6:9] = iron @ rotations.skew(x) @ right_jacobian(e[6:9])
+    by_error[:, 12:15] = iron @ to_sensor @ to_body
+    return iron @ x + e[0:3], iron @ to_sensor, body, by_error
+
+
+def _sun_head(instrument, known, e, at):
+    """Azimuth and elevation (2,) of the Sun in a head, and partials as the magnetometer's."""
+    by_error, to_body = np.zeros((2, SLOTS)), at.dcm_ecef_body.T
+    to_head = (instrument.dcm @ rotations.dcm_from_q(rotations.exp(e[4:7]))).T
+    nadir = -at.position_ecef_m / np.linalg.norm(at.position_ecef_m)
+    seen = instrument.dcm[:, 2] @ to_body @ nadir > instrument.site_ecef_m[0]
+    body = to_body @ (known + (e[7] + seen * e[2]) * nadir)
+    s = to_head @ body
+    normal, whole2 = np.hypot(s[1], s[2]), s @ s
+    p = np.array(
+        [
+            [0.0, s[2] / normal**2 - e[0] * s[1] / normal**3, -s[1] / normal**2 - e[0] * s[2] / normal**3],
+            [normal / whole2, -s[0] * s[1] / (whole2 * normal), -s[0] * s[2] / (whole2 * normal)],
+        ]
+    )
+    by_error[:, 4:7] = p @ rotations.skew(s) @ right_jacobian(e[4:7])
+    by_error[0, 0], by_error[1, 1] = 1.0 / normal, 1.0
+    by_error[:, 7] = p @ to_head @ to_body @ nadir
+    by_error[:, 2] = seen * by_error[:, 7]
+    by_error[:, 3] = -p @ to_head @ rotations.skew(body) @ at.turning_body[0]
+    h = np.array([np.arctan2(s[1], s[2]) + e[0] / normal, np.arctan2(s[0], normal) + e[1]])
+    return h + e[3] * by_error[:, 3], p @ to_head, body, by_error
+
+
 def predict(instrument, known, e, at):
     """Prediction (3,) and partials by state (3, 9) and by the instrument's own errors ``e`` (3, `SLOTS`)."""
     by_state, by_error = np.zeros((3, 9)), np.zeros((3, SLOTS))
     if instrument.kind in (FIELD, SUN):
-        body = at.dcm_ecef_body.T @ known
-        model = magnetometer_model if instrument.kind == FIELD else sun_model
-        reading, by_body, by_error[: len(instrument.components)] = model(instrument.dcm, body, e)
+        model = _magnetometer if instrument.kind == FIELD else _sun_head
+        reading, by_body, body, own = model(instrument, known, e, at)
         by_state[: len(reading), 6:9] = by_body @ rotations.skew(body)
+        by_error[: len(reading)] = own
         return np.append(reading, np.zeros(3 - len(reading))), by_state, by_error
     c, arm, tau = at.dcm_ecef_body, instrument.arm_body_m, e[3]
     turning, change, force = at.turning_body[:3]

@@ -305,7 +305,7 @@ def test_two_attitudes_differ_as_both_may_err():
     )  # fmt: skip
     history = SimpleNamespace(
         time_s=t, q_ecef_body=rotations.boxplus(one, 0.01 * rng.standard_normal((n, 3))),
-        covariance=np.tile(1e-4 * np.eye(3), (n, 1, 1)), observations=(),
+        covariance=np.tile(1e-4 * np.eye(3), (n, 1, 1)), sightings=(),
     )  # fmt: skip
     found = compare(history, theirs)
     # 600 draws of three know the mean to 3 %
