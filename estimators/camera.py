@@ -452,7 +452,7 @@ def without_doubtful(fits: list[FrameFit]) -> list[FrameFit]:
     """
     contradicts = np.array([fit.contradicted or getattr(fit.refused, "code", "") in _NOT_THE_SHELL for fit in fits])
     words = "two or more of the four frames around contradict the shell: an answer here may be chance"
-    around = np.convolve(contradicts, [1, 1, 0, 1, 1])[2:-2] if fits else []
+    around = np.convolve(contradicts, [1, 1, 0, 1, 1])[2:-2] if fits else contradicts
     doubtful = [not fit.refused and count >= _DOUBTFUL for fit, count in zip(fits, around, strict=True)]
     return _refused(fits, doubtful, Issue(words, "frames-around-refused"))
 
