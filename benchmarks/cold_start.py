@@ -66,7 +66,10 @@ def everything(folder, side_by_side):
     }
     took, compiled = {}, []
     if side_by_side:
-        stages = {"kernels side by side": lambda: warmup.prepare(warmup.GROUPS, lambda _fraction, _what: None), **stages}
+        stages = {
+            "kernels side by side": lambda: warmup.prepare(warmup.GROUPS, lambda _fraction, _what: None),
+            **stages,
+        }
     for name, work in stages.items():
         begun = time.perf_counter()
         with event.install_recorder("numba:compile") as recorder:
