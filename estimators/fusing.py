@@ -89,6 +89,8 @@ class Fused:
         Of all methods.
     reader : LoadsReader
         Of the loads, and of the camera where it is not left out, whatever was made of their disagreement.
+    best_s : float
+        Time of the smallest deflection sd by the posterior.
     limbs : Limbs or None
         None where the pulse gives no line; ``limbs_remark`` says why, or what the lines show.
     camera_time_bias : CameraTimeBias or None
@@ -102,17 +104,12 @@ class Fused:
     solution: Solution
     agreement: Agreement
     reader: LoadsReader
+    best_s: float
     limbs: Limbs | None = None
     limbs_remark: str = ""
     camera_time_bias: CameraTimeBias | None = None
     left_out: str | None = None
     alternatives: tuple[str, ...] = ()
-
-    @cached_property
-    def best_s(self) -> float:
-        """Time of the smallest deflection sd, s."""
-        time_s = self.history.time_s
-        return float(time_s[np.argmin(np.trace(self.solution.lateral_cov(time_s), axis1=1, axis2=2))])
 
     @property
     def remark(self) -> str:
@@ -303,7 +300,9 @@ class _Sources:
         faults = fault_hypotheses(self.loads, solution.input_posterior, CAMERA_PLANE_SD_RAD)
         tests = agreement(stated, solution.input_posterior, solution.deflection, faults)
         bias = _time_bias(solution, bias_sd_s, True) if CAMERA_TIME_BIAS in inputs else None
-        return Fused(history, solution, tests, reader, camera_time_bias=bias)
+        variance = np.trace(history.lateral_cov_without_plane, axis1=1, axis2=2)
+        best_s = float(history.time_s[np.argmin(variance)])
+        return Fused(history, solution, tests, reader, best_s, camera_time_bias=bias)
 
     def tested(self, fault: DivergenceError, bias_sd_s: float) -> Agreement:
         """Test of all methods' agreement without a common answer."""

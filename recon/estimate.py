@@ -113,7 +113,7 @@ class TrajectorySolution:
     adaptation : Adaptation
         What was found in the data, for other reconstructions that are to be compared with this one.
     single_faults : tuple of Explanation
-        Hypothesis hypotheses that explain what failed, the likeliest first.
+        Single hypotheses that explain what failed, the likeliest first.
     drag : DragHistory or None
         What the deceleration says of the air; None without accelerometer and drag.
     """

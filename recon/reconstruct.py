@@ -302,7 +302,7 @@ def _checks_at_rest(telemetry: Telemetry, settings: Settings) -> list[Check]:
 
 
 def _single_faults(case: Case, solution: TrajectorySolution, report: Progress) -> tuple[Explanation, ...]:
-    """Hypothesis hypotheses where a check fails, likeliest first; of both triads where their oscillation shows it."""
+    """Single hypotheses where a check fails, likeliest first; of both triads where their oscillation shows it."""
     of_readings = fault_isolation.ABOUT_DECELERATION
     if all(check.passed or check.code in of_readings for check in solution.consistency_checks):
         return ()
